@@ -25,7 +25,8 @@ import numpy as np
 from companion.analysis.contact import contact_summary
 from companion.analysis.log import Array
 from companion.commissioning.mocap.pivot import Probed, tip_off_m
-from companion.model.types import ContactMode, Outcome, Severity
+from companion.model.contact import ContactMode
+from companion.model.types import Outcome, Severity
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight

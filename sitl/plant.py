@@ -280,9 +280,10 @@ class Plant:
         if self._handling is not None:
             machine.hold(None if armed else self._handling.wrench(t_s, q, v))
         if self.jaws is not None:
-            self.jaws.step(t_s)
-            if self.scene.bar is not None:
-                self.scene.bar.closed[self.number] = self.jaws.closed
+            bar = self.scene.bar
+            self.jaws.step(t_s, bar is not None and bar.is_near(self.number))
+            if bar is not None:
+                bar.closed[self.number] = self.jaws.closed
         machine.command(self._rotors, tuple(torques_nm))
 
     def sense(self) -> None:

@@ -25,12 +25,7 @@ from tests.support import DEADLINE_S, Sandbox, sandbox_in
 _LOADED_COMPUTER = [HealthCheck.too_slow]
 """Neither this check nor a deadline may fail a test: both measure the computer."""
 settings.register_profile(
-    "test",
-    derandomize=True,
-    database=None,
-    max_examples=50,
-    deadline=None,
-    suppress_health_check=_LOADED_COMPUTER,
+    "test", derandomize=True, database=None, max_examples=50, deadline=None, suppress_health_check=_LOADED_COMPUTER
 )
 settings.register_profile(
     "explore",

@@ -20,7 +20,6 @@ import subprocess
 import sys
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +30,8 @@ from companion.cli.main import main
 from companion.config.arm import Tool
 from companion.config.tether import Tether
 from companion.config.vehicle import Vehicle
-from companion.model.types import Inputs, Outputs
+from companion.model.outputs import Outputs
+from companion.model.types import Inputs
 from companion.sitl_config.loader import load_sitl
 
 ROOT = Path(__file__).parents[1]
@@ -416,57 +416,6 @@ def _assert_keys(found: Any, wanted: dict[str, Any], where: str) -> None:
     for key, below in wanted.items():
         if below is not None:
             _assert_keys(found[key], below, f"{where}.{key}")
-
-
-@contextlib.contextmanager
-def serial_line() -> Iterator[tuple[int, str]]:
-    """A serial line: its far end, which only the test answers, and the name of the port at the near one."""
-    far, near = os.openpty()
-    try:
-        tty.setraw(near)
-        yield far, os.ttyname(near)
-    finally:
-        os.close(near)
-        os.close(far)
-
-
-@contextlib.contextmanager
-def plugged(name: Path, port: str) -> Iterator[str]:
-    """A port under a fixed name, as in /dev/serial/by-id, until it is unplugged; the name."""
-    name.symlink_to(port)
-    try:
-        yield str(name)
-    finally:
-        name.unlink()
-
-
-@contextlib.contextmanager
-def bridged(
-    udp: socket.socket, px4: tuple[str, int], open_stream: Callable[[], int], piece_bytes: int = 4096
-) -> Iterator[None]:
-    """Pass bytes between a stream, given by its descriptor, and PX4's UDP address; to the stream in pieces."""
-    ended = threading.Event()
-
-    def run() -> None:
-        stream = open_stream()
-        os.set_blocking(stream, False)
-        while not ended.is_set():
-            ready = select.select([stream, udp.fileno()], [], [], 0.01)[0]
-            with contextlib.suppress(OSError):  # the companion has closed its end, or does not read
-                if stream in ready:
-                    udp.sendto(os.read(stream, 4096), px4)
-                if udp.fileno() in ready:
-                    data = udp.recv(4096)
-                    for at in range(0, len(data), piece_bytes):
-                        os.write(stream, data[at : at + piece_bytes])
-
-    thread = threading.Thread(target=run, name="bridge")
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join(DEADLINE_S)
 
 
 def _port_range() -> Iterator[int]:

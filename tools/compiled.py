@@ -49,6 +49,8 @@ COMPILED = (
     "companion/phases/contact/way.py",
     "companion/phases/intercept/ball.py",
     "companion/phases/intercept/meeting.py",
+    "companion/phases/intercept/motion.py",
+    "companion/phases/intercept/net.py",
     "companion/model/*.py",
     "companion/io/dynamixel/scale.py",
     "companion/io/px4/delta_velocity.py",

@@ -13,7 +13,8 @@ from mcap.reader import make_reader
 
 from companion.analysis.timing import Stopwatch, Timing
 from companion.model.codec import from_json
-from companion.model.types import Inputs, Sent
+from companion.model.outputs import Sent
+from companion.model.types import Inputs
 
 Array = npt.NDArray[np.float64]
 

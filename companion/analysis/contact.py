@@ -12,8 +12,9 @@ from companion.analysis.arm_skeleton import pose
 from companion.analysis.log import Array, FlightLog
 from companion.model.arm_skeleton import ArmSkeleton, logged_skeleton
 from companion.model.best_pose import best_pose
+from companion.model.contact import ContactMode, ContactState
 from companion.model.frames import quat_rotate
-from companion.model.types import ContactMode, ContactState, Vec3
+from companion.model.types import Vec3
 from companion.phases.contact.surface import axes
 from companion.safety import notices
 

@@ -13,7 +13,9 @@ from companion.analysis.contact import PLANE_M, presses, surface_axes, tips_m
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import CATCH, DASHED, INK, REFERENCE, SERIES, SOFT, dress, figure_legend, new_figure
 from companion.analysis.time_axes import legend, line
-from companion.model.types import ContactMode, ControlLog, Vec3
+from companion.model.contact import ContactMode
+from companion.model.outputs import ControlLog
+from companion.model.types import Vec3
 
 _LEAVE, _MOVE = ("leave", "#f8eed8"), ("move", "#f1e9f7")
 _BANDS = {

@@ -12,14 +12,10 @@ import numpy as np
 
 from companion.analysis.log import FlightLog, LogError
 from companion.model.constants import TICK_PERIOD_S
+from companion.model.units import unit_of
 
 ABOUT = "columns.json"
 """File beside the tables: for each table its rate, and for each column its unit and frame."""
-_UNITS: Final = {
-    "_m_s3": "m/s^3", "_m_s2": "m/s^2", "_m_s": "m/s", "_deg_s": "deg/s", "_rad_s2": "rad/s^2", "_rad_s": "rad/s", "_n_m": "N/m",
-    "_nm": "N m", "_kg": "kg", "_deg": "deg", "_rad": "rad", "_hz": "Hz", "_ms": "ms", "_m": "m", "_s": "s", "_n": "N", "_v": "V",
-    "_c": "deg C", "_wxyz": "unit quaternion w, x, y, z",
-}  # fmt: skip
 _FRAMES: Final = ("world", "body", "sensor", "ned")
 _CODEBASE, _CHUNK = "v2.1", 1000
 """Version of the LeRobot dataset's layout, and the number of episodes in one of its folders."""
@@ -30,9 +26,8 @@ _INDICES = ("frame_index", "episode_index", "index", "task_index")
 def about_column(name: str) -> dict[str, str | None]:
     """Return unit and frame of a column, which its name states; None where it has none."""
     field = re.sub(r"\[\d+\]", "", name).rpartition(".")[2]
-    unit = next((unit for suffix, unit in _UNITS.items() if field.endswith(suffix)), None)
     frame = next((frame for frame in _FRAMES if f"_{frame}" in field), None)
-    return {"unit": unit, "frame": frame}
+    return {"unit": unit_of(field), "frame": frame}
 
 
 def write_tables(log: FlightLog, out: Path, suffix: str) -> list[Path]:

@@ -28,7 +28,8 @@ from companion.model.best_pose import best_pose
 from companion.model.codec import RecordError, from_json
 from companion.model.constants import GRADED_POSE_MAX_AGE_S
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import Inputs, MocapPose, Outputs, Sent
+from companion.model.outputs import Outputs, Sent
+from companion.model.types import Inputs, MocapPose
 from companion.plugins import PluginError
 
 Array = npt.NDArray[np.float64]

@@ -11,8 +11,9 @@ from typing import Any
 from companion.analysis.log import FlightLog
 from companion.model.codec import Record
 from companion.model.frames import quat_rotate
+from companion.model.outputs import Outputs
 from companion.model.team import Grip
-from companion.model.types import Outputs, Quat, Vec3
+from companion.model.types import Quat, Vec3
 
 _NEAR_S = 0.05
 """Longest time from a tick to the sample of the bar with which it is compared."""

@@ -11,7 +11,8 @@ from typing import Protocol
 from companion import __version__
 from companion.analysis.log import FlightLog, LogError, writer
 from companion.model.codec import differences, fingerprint, from_packet, to_packet
-from companion.model.types import Inputs, Outputs, Sent
+from companion.model.outputs import Outputs, Sent
+from companion.model.types import Inputs
 from companion.plugins import CONTROL_LAWS, KINDS, PHASES, installed
 
 OLDER_FINGERPRINTS = (

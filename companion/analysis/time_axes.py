@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.plot_style import DASHED, INK, dress, mark_catch, new_figure
-from companion.model.types import Outputs, PhaseKind
+from companion.model.outputs import Outputs
+from companion.model.types import PhaseKind
 
 _PHASES_NAMED_MAX = 40
 """Number of phases above which only kinds of phases are distinguished."""

@@ -9,8 +9,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 import numpy.typing as npt
 
+from companion.model.outputs import Outputs, Sent
 from companion.model.tick_times import TickTimes
-from companion.model.types import Inputs, Outputs, Sent
+from companion.model.types import Inputs
 
 Array = npt.NDArray[np.float64]
 

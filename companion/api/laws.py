@@ -1,7 +1,8 @@
 """For authors of control laws (docs/own-law.md): settings, inputs, outputs, and the parts that the companion's own laws share."""
 
 from companion.config.base import NonNegative, Positive, Positive3
-from companion.config.controller import LawConfig, NonNegative3, NonNegativeJoints, PositiveJoints, fitted
+from companion.config.controller import LawConfig
+from companion.config.gains import NonNegative3, NonNegativeJoints, PositiveJoints, fitted
 from companion.config.tuned_gain import TunedGain
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of

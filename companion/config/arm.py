@@ -269,9 +269,14 @@ class Jaws(Model):
     open_deg: Annotated[float, Field(ge=-360, le=360)]
     """Angle of the shaft (register 132) with open jaws."""
     closed_deg: Annotated[float, Field(ge=-360, le=360)]
-    """Angle of the shaft with the jaws closed around the handle."""
+    """Angle of the shaft with the jaws closed around the handle; empty jaws close further."""
     current_a: Annotated[float, Field(gt=0, le=5)] = 0.4
     """Largest current (register 102), with which the jaws press."""
+
+    @property
+    def empty_deg(self) -> float:
+        """Angle to which closing jaws are sent: beyond `closed_deg`, where a handle stops them."""
+        return self.closed_deg + math.copysign(JAWS_BEYOND_DEG, self.closed_deg - self.open_deg)
 
     @model_validator(mode="after")
     def _opens(self) -> Self:
@@ -282,6 +287,8 @@ class Jaws(Model):
         return self
 
 
+JAWS_BEYOND_DEG = 20.0
+"""Angle by which empty jaws close further than jaws around a handle."""
 JAWS_TOLERANCE_DEG = 5.0
 """The jaws are open or closed if their servo is this near to the angle."""
 

@@ -17,45 +17,17 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
 
 from companion import plugins
 from companion.config import tuned_gain
-from companion.config.base import JOINTS_MAX, Location, Model, NonNegative, OrElse, Positive, Positive3, refuse
+from companion.config.base import Location, Model, NonNegative, Positive, Positive3, refuse
+from companion.config.gains import (
+    NonNegative3,
+    NonNegativeJoints,
+    NonNegativeRows,
+    Positive4,
+    PositiveJoints,
+    PositiveRows,
+    six_digits,
+)
 from companion.config.tuned_gain import TunedGain
-
-
-def _as_joints(given: Any) -> Any:
-    """Return one number as the gain of all joints, and a list as the tuple that strict validation expects after this function."""
-    if isinstance(given, int | float):
-        return (given,)
-    return tuple(given) if isinstance(given, list) else given
-
-
-PositiveRows = Annotated[tuple[Positive, ...], Field(min_length=7, max_length=6 + JOINTS_MAX)]
-"""One value for each of x, y, z, roll, pitch, yaw and for each joint. A vehicle with n joints uses the first 6 + n values; if there are
-fewer, the last value applies to the remaining joints too. So one file of gains serves every arm.
-"""
-NonNegativeRows = Annotated[tuple[NonNegative, ...], Field(min_length=7, max_length=6 + JOINTS_MAX)]
-PositiveJoints = Annotated[tuple[Positive, ...], Field(min_length=1, max_length=JOINTS_MAX)]
-"""One value for each joint. A vehicle with n joints uses the first n values; if there are fewer, the last value applies to the
-remaining joints too.
-"""
-NonNegativeJoints = Annotated[
-    tuple[NonNegative, ...],
-    Field(min_length=1, max_length=JOINTS_MAX),
-    BeforeValidator(_as_joints),
-    OrElse({"type": "number"}),
-]
-"""One value for each joint, as in `PositiveJoints`, or one number for all joints."""
-NonNegative3 = tuple[NonNegative, NonNegative, NonNegative]
-Positive4 = tuple[Positive, Positive, Positive, Positive]
-
-
-def six_digits(value: float) -> float:
-    """Return the value rounded to six significant digits, as a file of found gains states it."""
-    return float(f"{value:.6g}")
-
-
-def fitted(gains: tuple[float, ...], count: int) -> tuple[float, ...]:
-    """Return the gains of the first `count` rows or joints; the last gain is repeated for those beyond the list."""
-    return (*gains, *gains[-1:] * (count - len(gains)))[:count]
 
 
 class ControllerConfig(Model):

@@ -27,20 +27,24 @@ BUILT_IN = {
 
 
 @functools.cache
-def device_class(group: str, name: str) -> Any:
+def device_class(group: str, name: str, methods: tuple[str, ...] = ()) -> Any:
     """Return the class of an installed device.
 
     Args:
         group: group of entry points, such as `companion.plugins.FORCE_SENSORS`.
+        methods: names of the methods that it must have.
 
     Raises:
-        PluginError: the device is not installed, cannot be imported or has no model for its options.
+        PluginError: the device is not installed, cannot be imported, has no model for its options or lacks a method.
     """
     plugin = plugins.find(group, name)
     found = plugin.load()
     options = getattr(found, "options", None)
     if not (isinstance(options, type) and issubclass(options, Model)):
         raise plugin.error("its attribute 'options' is not a subclass of companion.config.base.Model")
+    for method in methods:
+        if not callable(getattr(found, method, None)):
+            raise plugin.error(f"its class has no method {method}()")
     return found
 
 

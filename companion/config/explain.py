@@ -17,18 +17,17 @@ from pydantic_core import ErrorDetails
 
 from companion.config.base import Location, Model
 from companion.config.document import RANK_KEY, RANK_MISSING, RANK_VALUE, Data, Document, Origin, Problem, key_path
+from companion.model.units import UNITS, split_unit
 
 M = TypeVar("M", bound=Model)
 _Node = dict[str, Any]
 
-UNITS = {
-    "m": "m", "mm": "mm", "cm": "cm", "km": "km", "ft": "ft", "feet": "ft", "in": "in", "inch": "in",
-    "s": "s", "ms": "ms", "us": "us", "min": "min", "sec": "s", "seconds": "s", "h": "h",
-    "deg": "deg", "rad": "rad", "degrees": "deg", "radians": "rad", "rpm": "rpm",
-    "m_s": "m/s", "m_s2": "m/s^2", "mm_s": "mm/s", "cm_s": "cm/s", "km_h": "km/h", "kmh": "km/h", "mps": "m/s", "mph": "mph",
-    "deg_s": "deg/s", "deg_s2": "deg/s^2", "rad_s": "rad/s", "rad_s2": "rad/s^2", "ft_s": "ft/s",
-    "kg": "kg", "g": "g", "lb": "lb", "lbs": "lb", "n": "N", "kn": "kN", "lbf": "lbf", "nm": "N m", "nms": "N m s", "nm_a": "N m/A",
-    "hz": "Hz", "khz": "kHz", "a": "A", "ma": "mA", "v": "V", "mv": "mV", "c": "degC", "kgf": "kgf",
+_UNITS = {
+    **UNITS,
+    "cm": "cm", "km": "km", "ft": "ft", "feet": "ft", "in": "in", "inch": "in", "min": "min", "sec": "s", "seconds": "s", "h": "h",
+    "degrees": "deg", "radians": "rad", "rpm": "rpm", "mm_s": "mm/s", "cm_s": "cm/s", "km_h": "km/h", "kmh": "km/h", "mps": "m/s",
+    "mph": "mph", "ft_s": "ft/s", "g": "g", "lb": "lb", "lbs": "lb", "kn": "kN", "lbf": "lbf", "kgf": "kgf", "khz": "kHz",
+    "ma": "mA", "mv": "mV",
 }  # fmt: skip
 """Units by key suffix, including units that no key uses."""
 MANY_OPTIONS = 12
@@ -179,12 +178,12 @@ def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[st
     """Return the message about an unknown key, and the known key that was probably meant or None."""
     key = str(at[-1])
     known = list((parent or {}).get("properties", {}))
-    stem, unit = split_unit(key)
+    stem, unit = split_unit(key, _UNITS)
     for candidate in known:
-        candidate_stem, candidate_unit = split_unit(candidate)
+        candidate_stem, candidate_unit = split_unit(candidate, _UNITS)
         if candidate_unit is not None and candidate_stem == stem and candidate != key:
-            here = f", in {UNITS[candidate_unit]}"
-            what = f"not in {UNITS[unit]}" if unit is not None else "without a unit"
+            here = f", in {_UNITS[candidate_unit]}"
+            what = f"not in {_UNITS[unit]}" if unit is not None else "without a unit"
             return f"unknown key; write {candidate}{here} ({what})", candidate
     close = nearest(key, known)
     if close is not None:
@@ -192,16 +191,6 @@ def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[st
     given = document.find(at[:-1])
     free = [name for name in known if not (isinstance(given, dict) and name in given)]
     return f"unknown key; known keys: {', '.join(free or known)}", None
-
-
-def split_unit(key: str) -> tuple[str, str | None]:
-    """Split a key before its longest unit suffix: `duration_ms` gives ("duration", "ms"); a key without a unit gives (key, None)."""
-    parts = key.split("_")
-    for count in (3, 2, 1):
-        suffix = "_".join(parts[-count:]).lower()
-        if len(parts) > count and suffix in UNITS:
-            return "_".join(parts[:-count]), suffix
-    return key, None
 
 
 def _hint(value: Data, node: _Node | None) -> str:

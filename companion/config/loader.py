@@ -14,8 +14,7 @@ from pydantic import ValidationError
 from companion.config import device_plugins
 from companion.config.arm import NO_ARM
 from companion.config.base import Location, Model
-from companion.config.controller import LAWS, AnyControllerConfig, ControllerConfig, law_class, preset_file
-from companion.config.controller import PRESETS as PRESETS
+from companion.config.controller import LAWS, PRESETS, AnyControllerConfig, ControllerConfig, law_class, preset_file
 from companion.config.device_plugins import DYNAMIXEL
 from companion.config.devices import ANY_INTERFACE
 from companion.config.document import (

@@ -99,7 +99,7 @@ class _Robot:
         self._shown = str(path)
         root = self._parse(self._text(path))
         if root.tag != "robot":
-            self._fail(root.position, f"expected a <robot> element, got <{root.tag}>")
+            self._fail(root, f"expected a <robot> element, got <{root.tag}>")
         self._root = root
         self._links: dict[str, _Element] = {}
         self._joints: dict[str, list[_Joint]] = {}
@@ -109,13 +109,13 @@ class _Robot:
             if element.tag == "link":
                 name = self._attribute(element, "name")
                 if name in self._links:
-                    self._fail(element.position, f'link "{name}" is defined twice')
+                    self._fail(element, f'link "{name}" is defined twice')
                 self._links[name] = element
         parents: dict[str, _Joint] = {}
         for joint in map(self._joint, (element for element in root.children if element.tag == "joint")):
             if joint.child in parents:
                 text = f'{joint} closes a loop: link "{joint.child}" is already the child of {parents[joint.child]}'
-                self._fail(joint.element.position, text + "; expected a serial arm")
+                self._fail(joint.element, text + "; expected a serial arm")
             parents[joint.child] = joint
             self._joints.setdefault(joint.parent, []).append(joint)
         self._roots = [name for name in self._links if name not in parents]
@@ -127,28 +127,27 @@ class _Robot:
             if key not in attributes and ":" not in key and key != "xmlns":
                 known = nearest(key, list(attributes))
                 hint = f"did you mean {known}?" if known else f"known: {', '.join(attributes) or 'none'}"
-                self._fail(element.position, f"<{element.tag}>: unknown attribute {key}; {hint}")
+                self._fail(element, f"<{element.tag}>: unknown attribute {key}; {hint}")
         found = set[str]()
         for child in element.children:
             if child.tag not in children and ":" not in child.tag:
                 known = nearest(child.tag, list(children))
                 hint = f"did you mean <{known}>?" if known else f"known: {', '.join(children) or 'none'}"
-                self._fail(child.position, f"<{element.tag}>: unknown element <{child.tag}>; {hint}")
+                self._fail(child, f"<{element.tag}>: unknown element <{child.tag}>; {hint}")
             if child.tag in _WORDS:
                 if child.tag in found and element.tag != "robot":
-                    self._fail(child.position, f"<{element.tag}>: a second <{child.tag}>, expected one")
+                    self._fail(child, f"<{element.tag}>: a second <{child.tag}>, expected one")
                 self._check_words(child)
             found.add(child.tag)
 
     def arm(self, base: str | None, tip: str | None) -> dict[str, Data]:
         """See `read_urdf`."""
-        position = self._root.position
         for key, name in (("urdf_base", base), ("urdf_tip", tip)):
             if name is not None and name not in self._links:
-                self._fail(position, f'{key}: there is no link "{name}"; the file has {", ".join(self._links)}')
+                self._fail(self._root, f'{key}: there is no link "{name}"; the file has {", ".join(self._links)}')
         if base is None and len(self._roots) != 1:
             found = f"{len(self._roots)} ({', '.join(self._roots)})" if self._roots else "none (the joints form a loop)"
-            self._fail(position, f"expected one link that is no joint's child, got {found}; urdf_base names the base")
+            self._fail(self._root, f"expected one link that is no joint's child, got {found}; urdf_base names the base")
         body = base if base is not None else self._roots[0]
         frames, moving = self._rigid(body, {body})
         seen = set(frames)
@@ -157,32 +156,28 @@ class _Robot:
             if len(moving) > 1:
                 first, second = moving[:2]
                 text = f'{second} starts a second branch beside {first}; expected a serial arm: make it "fixed"'
-                self._fail(second.element.position, text)
+                self._fail(second.element, text)
             joint = moving[0]
             if len(links) == JOINTS_MAX:
-                self._fail(
-                    joint.element.position, f"{joint} is moving joint {JOINTS_MAX + 1}; expected at most {JOINTS_MAX}"
-                )
+                self._fail(joint.element, f"{joint} is moving joint {JOINTS_MAX + 1}; expected at most {JOINTS_MAX}")
             origin = _compose(frames[joint.parent], self._pose(joint.element))
             frames, moving = self._rigid(joint.child, seen)
             links.append(self._link(joint, origin, frames))
         if not links:
-            self._fail(position, f'no revolute or continuous joint moves a link of the arm on "{body}"')
+            self._fail(self._root, f'no revolute or continuous joint moves a link of the arm on "{body}"')
         last = next(iter(frames))
         if tip is None:
             leaves = [name for name in frames if name not in self._joints and name != last]
             if len(leaves) != 1:
                 found = f"{len(leaves)} ({', '.join(leaves)})" if leaves else "none"
                 self._fail(
-                    self._links[last].position,
+                    self._links[last],
                     f'expected one link that is fixed to the last link "{last}" and marks the tip, got {found}; '
                     "add one, or name it as urdf_tip",
                 )
             tip = leaves[0]
         elif tip not in frames:
-            self._fail(
-                self._links[tip].position, f'urdf_tip: link "{tip}" is not fixed to the last moving link, "{last}"'
-            )
+            self._fail(self._links[tip], f'urdf_tip: link "{tip}" is not fixed to the last moving link, "{last}"')
         rotation, (x, y, z) = frames[tip]
         return {"links": links, "tip_m": [x, y, z], "tip_rpy_deg": list(_rpy_deg(rotation))}
 
@@ -195,21 +190,17 @@ class _Robot:
             name = waiting.pop(0)
             for joint in self._joints.get(name, ()):
                 if joint.child in seen:
-                    self._fail(joint.element.position, f'{joint} closes a loop at link "{joint.child}"')
+                    self._fail(joint.element, f'{joint} closes a loop at link "{joint.child}"')
                 seen.add(joint.child)
                 if joint.element.child("mimic") is not None:
-                    self._fail(
-                        joint.element.position, f"{joint}: <mimic> is not supported; expected a joint of its own"
-                    )
+                    self._fail(joint.element, f"{joint}: <mimic> is not supported; expected a joint of its own")
                 if joint.kind in MOVING:
                     moving.append(joint)
                 elif joint.kind == "fixed":
                     frames[joint.child] = _compose(frames[name], self._pose(joint.element))
                     waiting.append(joint.child)
                 else:
-                    self._fail(
-                        joint.element.position, f'{joint}: expected revolute, continuous or fixed, got "{joint.kind}"'
-                    )
+                    self._fail(joint.element, f'{joint}: expected revolute, continuous or fixed, got "{joint.kind}"')
         return frames, moving
 
     def _link(self, joint: _Joint, origin: _Pose, frames: dict[str, _Pose]) -> Data:
@@ -218,12 +209,12 @@ class _Robot:
         axis = (1.0, 0.0, 0.0) if axis_element is None else self._numbers3(axis_element, "xyz", (1.0, 0.0, 0.0))
         norm = math.hypot(*axis)
         if not norm > 1e-6:
-            self._fail((axis_element or joint.element).position, f"{joint}: the axis is zero, expected a direction")
+            self._fail(axis_element or joint.element, f"{joint}: the axis is zero, expected a direction")
         parts = [part for name, frame in frames.items() if (part := self._inertial(name, frame)) is not None]
         link = self._links[joint.child]
         if not parts:
             self._fail(
-                link.position,
+                link,
                 f'link "{joint.child}" moves but has no <inertial> with a mass; expected mass, centre of mass and inertia',
             )
         mass = sum(part[0] for part in parts)
@@ -259,21 +250,21 @@ class _Robot:
             return None
         mass_element, inertia_element = inertial.child("mass"), inertial.child("inertia")
         if mass_element is None or inertia_element is None:
-            self._fail(inertial.position, f'link "{name}": expected <mass> and <inertia> in <inertial>')
+            self._fail(inertial, f'link "{name}": expected <mass> and <inertia> in <inertial>')
         (mass,) = self._numbers(mass_element, "value", 1)
         xx, yy, zz, xy, xz, yz = moments = [self._numbers(inertia_element, key, 1)[0] for key in _WORDS["inertia"][0]]
         if mass >= 0.0 and max(mass, *map(abs, moments)) <= FRAME_MASS_MAX_KG:
             return None
         if not mass > 0.0:
-            self._fail(mass_element.position, f'link "{name}": expected a mass above 0 kg, got {mass:g} kg')
+            self._fail(mass_element, f'link "{name}": expected a mass above 0 kg, got {mass:g} kg')
         inertia: Mat3 = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
         if not is_physical_inertia(inertia):
             text = f'link "{name}": expected the inertia of a rigid body (no principal moment above the sum of the other two)'
-            self._fail(inertia_element.position, f"{text}, got ixx {xx:g}, iyy {yy:g}, izz {zz:g} kg m^2")
+            self._fail(inertia_element, f"{text}, got ixx {xx:g}, iyy {yy:g}, izz {zz:g} kg m^2")
         gyration_m = math.sqrt((xx + yy + zz) / 2.0 / mass)
         if gyration_m > LENGTH_MAX_M:
             text = f'link "{name}": the inertia is that of {mass:g} kg at a distance of {gyration_m:g} m'
-            self._fail(inertia_element.position, f"{text}; expected kg m^2 and kg (is the file in mm or g?)")
+            self._fail(inertia_element, f"{text}; expected kg m^2 and kg (is the file in mm or g?)")
         rotation, com = _compose(frame, self._pose(inertial))
         return mass, com, mat_mat(rotation, mat_mat(inertia, transpose(rotation)))
 
@@ -283,10 +274,10 @@ class _Robot:
         for tag in ("parent", "child"):
             end = element.child(tag)
             if end is None:
-                self._fail(element.position, f'joint "{name}": missing <{tag}>')
+                self._fail(element, f'joint "{name}": missing <{tag}>')
             link = self._attribute(end, "link")
             if link not in self._links:
-                self._fail(end.position, f'joint "{name}": there is no link "{link}"')
+                self._fail(end, f'joint "{name}": there is no link "{link}"')
             ends.append(link)
         return _Joint(name, kind, ends[0], ends[1], element)
 
@@ -299,21 +290,21 @@ class _Robot:
         distance_m = math.hypot(*position)
         if distance_m > LENGTH_MAX_M:
             text = f"the origin is {distance_m:g} m away; expected metres and at most {LENGTH_MAX_M:g} m"
-            self._fail(origin.position, text + " (is the file in millimetres?)")
+            self._fail(origin, text + " (is the file in millimetres?)")
         roll, pitch, yaw = rpy = self._numbers3(origin, "rpy", (0.0, 0.0, 0.0))
         if max(map(abs, rpy)) > ANGLE_MAX_RAD:
             text = (
                 f'<origin>: rpy: expected radians, at most 2 pi, got "{origin.attributes["rpy"]}" (is it in degrees?)'
             )
-            self._fail(origin.position, text)
+            self._fail(origin, text)
         if "quat_xyzw" not in origin.attributes:
             return rotation_matrix(quat_from_euler_zyx(roll, pitch, yaw)), position
         if "rpy" in origin.attributes:
-            self._fail(origin.position, "<origin>: expected rpy or quat_xyzw, got both")
+            self._fail(origin, "<origin>: expected rpy or quat_xyzw, got both")
         x, y, z, w = self._numbers(origin, "quat_xyzw", 4)
         norm = math.hypot(x, y, z, w)
         if abs(norm - 1.0) > 0.01:
-            self._fail(origin.position, f"<origin>: quat_xyzw: expected a quaternion of norm 1, got norm {norm:g}")
+            self._fail(origin, f"<origin>: quat_xyzw: expected a quaternion of norm 1, got norm {norm:g}")
         return rotation_matrix((w / norm, x / norm, y / norm, z / norm)), position
 
     def _numbers3(self, element: _Element, key: str, default: Vec3) -> Vec3:
@@ -330,12 +321,12 @@ class _Robot:
             values = []
         if len(values) != count or not all(map(math.isfinite, values)):
             expected = "a number" if count == 1 else f"{count} numbers"
-            self._fail(element.position, f'<{element.tag}>: {key}: expected {expected}, got "{text[:60]}"')
+            self._fail(element, f'<{element.tag}>: {key}: expected {expected}, got "{text[:60]}"')
         return values
 
     def _attribute(self, element: _Element, key: str) -> str:
         if key not in element.attributes:
-            self._fail(element.position, f"<{element.tag}>: missing {key}")
+            self._fail(element, f"<{element.tag}>: missing {key}")
         return element.attributes[key]
 
     def _text(self, path: Path) -> bytes:
@@ -379,7 +370,9 @@ class _Robot:
             self._fail("1:1", f"not XML: {error}")
         return roots[0]
 
-    def _fail(self, position: str, text: str) -> NoReturn:
+    def _fail(self, at: _Element | str, text: str) -> NoReturn:
+        """Refuse the file, given an element or line and column."""
+        position = at if isinstance(at, str) else at.position
         raise ConfigError([f"{self._shown}:{position}: {text}"])
 
 

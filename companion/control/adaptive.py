@@ -26,7 +26,8 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar, Final
 
-from companion.config.controller import AdaptiveConfig, fitted
+from companion.config.controller import AdaptiveConfig
+from companion.config.gains import fitted
 from companion.config.vehicle import Vehicle
 from companion.control.common import AccelerationFilter, Actuation, DesiredForce, ForceFilter, tracking_errors
 from companion.control.compensation import Compensation
@@ -37,7 +38,8 @@ from companion.control.scaled_gains import for_vehicle
 from companion.control.types import PlantState, Wrench
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import body_x_z_axes_world
-from companion.model.types import ControlLog, Reference, Vec4
+from companion.model.outputs import ControlLog
+from companion.model.types import Reference, Vec4
 
 
 class Row:

@@ -21,7 +21,8 @@ from companion.control.types import PlantState, Wrench
 from companion.model.algebra import minus
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import wrap_rad
-from companion.model.types import IDENTITY_QUAT, Chi, ControlLog, Joints, Quat, Reference, Vec3
+from companion.model.outputs import ControlLog
+from companion.model.types import IDENTITY_QUAT, Chi, Joints, Quat, Reference, Vec3
 
 
 def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[Chi, Chi]:

@@ -16,6 +16,7 @@ lasts is removed by `ForceObserver.step`; a gust is not.
 from __future__ import annotations
 
 import math
+import operator
 from typing import Final
 
 from companion.config.arm_chain import chain_of
@@ -126,7 +127,7 @@ class ForceObserver:
         """Return G d^2(R h)/dt^2; `k` is the gain of the filters, which are implicit, so that this is exact."""
         before, self._stamps_s = self._stamps_s, stamps_s
         moments = self._moments
-        gap = before is not None and stamps_s is not None and max(map(_difference, stamps_s, before)) > GAP_MAX_S
+        gap = before is not None and stamps_s is not None and max(map(operator.sub, stamps_s, before)) > GAP_MAX_S
         if moments is None or gap or (before is None) != (stamps_s is None):
             moments = (moment_world, moment_world)
         (ax, ay, az), (bx, by, bz), (mx, my, mz) = *moments, moment_world
@@ -135,7 +136,3 @@ class ForceObserver:
         self._moments = ((ax, ay, az), (bx, by, bz))
         per_s2 = 1.0 / (TIME_S * TIME_S)
         return (per_s2 * (mx - 2.0 * ax + bx), per_s2 * (my - 2.0 * ay + by), per_s2 * (mz - 2.0 * az + bz))
-
-
-def _difference(now_s: float, before_s: float) -> float:
-    return now_s - before_s

@@ -15,7 +15,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from companion.config.controller import AdaptiveConfig, fitted
+from companion.config.controller import AdaptiveConfig
+from companion.config.gains import fitted
 from companion.control.compensation import FRICTION_RATE_RAD_S
 from companion.control.manipulator import Manipulator
 from companion.model.types import Chi, Joints, Matrix, Vec3

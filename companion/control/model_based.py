@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-from companion.config.controller import LawConfig, fitted
+from companion.config.controller import LawConfig
+from companion.config.gains import fitted
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors, wrench_of

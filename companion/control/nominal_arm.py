@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from companion.config.controller import AdaptiveConfig, fitted
+from companion.config.controller import AdaptiveConfig
+from companion.config.gains import fitted
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of
 from companion.control.types import PlantState

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from companion.config.arm_chain import chain_of
-from companion.config.controller import ControllerConfig, LawConfig, Machine, fitted, law_class
+from companion.config.controller import ControllerConfig, LawConfig, Machine, law_class
+from companion.config.gains import fitted
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_text import flow_text
 from companion.control.arm_model.chain_dynamics import ChainDynamics

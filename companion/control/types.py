@@ -9,7 +9,8 @@ from typing import Protocol
 from companion.config.controller import ControllerConfig
 from companion.config.vehicle import Vehicle
 from companion.model.codec import Record
-from companion.model.types import ControlLog, Joints, Quat, Reference, Vec3
+from companion.model.outputs import ControlLog
+from companion.model.types import Joints, Quat, Reference, Vec3
 
 
 class Tuning(Enum):

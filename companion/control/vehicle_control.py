@@ -23,7 +23,8 @@ from companion.model.algebra import across, dot
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
-from companion.model.types import AttitudeSetpoint, ControlLog, Inputs, Joints, Reference, Vec3
+from companion.model.outputs import ControlLog
+from companion.model.types import AttitudeSetpoint, Inputs, Joints, Reference, Vec3
 
 FOLD_RATE_RAD_S = 1.2
 PULL_TIME_S, PULL_LAG_S, PULL_MAX_N = 0.1, 0.05, 100.0

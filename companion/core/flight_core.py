@@ -28,13 +28,12 @@ from companion.model.algebra import across
 from companion.model.best_pose import pose_used_s
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.flight_stage import Stage
+from companion.model.outputs import ControlLog, Outputs
 from companion.model.types import (
-    ControlLog,
     Event,
     Inputs,
     MocapPose,
     OperatorCommand,
-    Outputs,
     PhaseKind,
     Reference,
     SafetyAction,

@@ -21,10 +21,11 @@ from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import AutopilotRequest, Inputs, Joints, Outcome, PhaseKind, SafetyAction, Severity
 from companion.safety import notices, rules
 from companion.safety.autopilot_landing import FLIPPED, KILLED, TIPPED
+from companion.safety.device_rules import PILOT_TOOK_OVER
 from companion.safety.mocap import unfused
 from companion.safety.notices import EventDefinition
 from companion.safety.px4 import DISARMED_ABOVE_M
-from companion.safety.rules import CRASHED, PILOT_TOOK_OVER
+from companion.safety.rules import CRASHED
 
 ARMED_SHOWN_S = 1.5
 """PX4's HEARTBEAT reports once a second whether it is armed: for this time after a request to arm, "not armed" may be outdated."""

@@ -11,13 +11,8 @@ from typing import Any, NamedTuple, TypeVar
 
 from companion.model.commands import COMMANDS, SAFER_COMMANDS
 from companion.model.launcher_messages import Land
-from companion.model.types import (
-    GroundCommand,
-    OperatorCommand,
-    Outputs,
-    PhaseKind,
-    SafetyAction,
-)
+from companion.model.outputs import Outputs
+from companion.model.types import GroundCommand, OperatorCommand, PhaseKind, SafetyAction
 from companion.runtime import ipc
 
 WAITING_MAX = 32

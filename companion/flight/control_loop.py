@@ -20,6 +20,7 @@ from companion.model.launcher_messages import (
     Px4Text,
     Status,
 )
+from companion.model.outputs import Outputs, Sent
 from companion.model.types import (
     AutopilotRequest,
     Event,
@@ -28,9 +29,7 @@ from companion.model.types import (
     Joints,
     OperatorCommand,
     Outcome,
-    Outputs,
     SafetyAction,
-    Sent,
     Severity,
     VehicleState,
 )

@@ -7,21 +7,20 @@ import msgspec
 from companion.guardian.client import GuardianClient
 from companion.guardian.heartbeat import Heartbeat
 from companion.model.best_pose import best_pose, pose_used_s
+from companion.model.contact import ContactMode, ContactState
 from companion.model.flight_stage import PILOT_FLIES
+from companion.model.outputs import Outputs
 from companion.model.types import (
     IDENTITY_QUAT,
     AutopilotRequest,
     AutopilotStatus,
-    ContactMode,
-    ContactState,
     Inputs,
     LinkIdentity,
-    Outputs,
     PhaseKind,
     Vec3,
 )
 from companion.phases.contact.force import way_back_m
-from companion.safety.rules import MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS, PILOT_TOOK_OVER
+from companion.safety.device_rules import MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS, PILOT_TOOK_OVER
 
 _IN_THE_AIR = frozenset({PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING})
 _REFUSALS = frozenset({MOCAP_DRAGGED, MOCAP_FROZEN, MOCAP_SWAPPED, MOCAP_TWO_STREAMS})

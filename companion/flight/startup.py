@@ -19,12 +19,12 @@ from companion.model.observations import Observations
 from companion.model.types import Vec3
 from companion.preflight import run as preflight
 from companion.preflight.px4 import text_of
+from companion.px4.required import HOVER
 from companion.recorder.client import RecorderClient
 from companion.runtime import ipc
 from companion.runtime.clock import Clock
 
 PATH_POINTS_MAX = 300
-_HOVER_PARAM = "MPC_THR_HOVER"
 
 
 class Refused(Exception):
@@ -116,10 +116,10 @@ async def with_hover_thrust(config: FlightConfig, autopilot: Autopilot) -> Fligh
     airframe = config.vehicle.airframe
     if airframe.hover_thrust is not None:
         return config
-    value = float(await autopilot.read_param(_HOVER_PARAM))
+    value = float(await autopilot.read_param(HOVER))
     if not 0.1 <= value <= 0.8:
         raise DeviceError(
-            f"autopilot: {_HOVER_PARAM} = {value:.3f} is not a plausible hover thrust, expected 0.1 to 0.8;"
+            f"autopilot: {HOVER} = {value:.3f} is not a plausible hover thrust, expected 0.1 to 0.8;"
             f" set it in PX4 or give airframe.hover_thrust"
         )
     airframe = airframe.model_copy(update={"hover_thrust": value})

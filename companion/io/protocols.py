@@ -21,6 +21,7 @@ from companion.model.observations import (
     ServoReport,
     StateCounts,
 )
+from companion.model.outputs import Outputs
 from companion.model.team import BarPose, ClampCommand, ClampState, PartnerState, TeamState
 from companion.model.types import (
     ArmState,
@@ -32,7 +33,6 @@ from companion.model.types import (
     Joints,
     LinkIdentity,
     MocapPose,
-    Outputs,
     VehicleState,
 )
 

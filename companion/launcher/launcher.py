@@ -10,12 +10,11 @@ import contextlib
 import json
 import os
 import select
-import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -25,31 +24,25 @@ import msgspec
 from companion.config.loader import FlightConfig
 from companion.launcher.cpu_contention import CpuContention
 from companion.launcher.guardian_process import GuardianProcess
+from companion.launcher.reports import FlightReports
 from companion.launcher.shared_time import SharedTime
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.exit_codes import EXIT_CODES
 from companion.model.launcher_messages import (
     AnyMessage,
     Busy,
-    FlightEnded,
     FlightEvent,
     Land,
     Message,
     Pace,
-    Px4Text,
-    RefusedFlight,
-    Started,
     Status,
     Unreadable,
 )
-from companion.model.types import Outcome, PhaseKind, SafetyAction, Severity
+from companion.model.types import Outcome, SafetyAction, Severity
 from companion.runtime import ipc
 from companion.runtime.cores import keep_off
 from companion.runtime.subprocesses import (
     LaunchError,
-    holds_traceback,
-    how_it_ended,
-    last_line,
     remove_file,
     scratch_folder,
     terminate,
@@ -133,19 +126,14 @@ class Launcher:
         self._on_message = on_message
         self._stop_requested = False
         self._channel: socket.socket | None = None
-        self._result: FlightEnded | None = None
-        self._refused: Sequence[str] | None = None
-        self._critical_events: list[tuple[int, str]] = []
-        """Tick and text of the events that end a flight; those of the first tick are the cause, later ones its consequences."""
-        self._events: list[dict[str, Any]] = []
-        self._px4_texts: list[str] = []
-        """Texts that PX4 has sent since the flight began."""
-        self._failures: list[str] = []
-        self._recorder_pid: int | None = None
+        self._reports = FlightReports()
         self._guardian: GuardianProcess | None = None
         self._cpu_contention = CpuContention({})
-        self.flying = False
-        """Whether the flight process is ticking and sending ten status messages per second; False after the flight."""
+
+    @property
+    def flying(self) -> bool:
+        """Whether the flight process is ticking; False after the flight."""
+        return self._reports.flying
 
     def request_landing(self) -> None:
         """Request a landing (Ctrl-C); repeated requests change nothing."""
@@ -185,16 +173,16 @@ class Launcher:
         world = sitl.final if sitl is not None else {}
         if world.get("crashed") and outcome is not Outcome.REFUSED:
             outcome = Outcome.CRASHED
-        recorded = self._result.recorded if self._result is not None else None
+        recorded = self._reports.result.recorded if self._reports.result is not None else None
         events = () if self._guardian is None else tuple(event.for_summary() for event in self._guardian.events)
         return FlightResult(
             outcome=outcome,
             recorder=None if recorded is None else msgspec.structs.asdict(recorded),
             world=world,
-            events=tuple(self._events),
+            events=tuple(self._reports.events),
             guardian_events=events,
             pace=self._pace,
-            lines=self._user_lines(outcome),
+            lines=self._reports.user_lines(outcome, self._cpu_contention.message),
         )
 
     def _fly(self, config_path: Path, sitl: SitlProcess | None, tmp: Path) -> Outcome:
@@ -247,72 +235,18 @@ class Launcher:
                 self._watch(process, ours, guardian, sitl)
             finally:
                 self._channel = None
-                terminate(process, patience_s=30.0 if self._result is None else 10.0)
+                terminate(process, patience_s=30.0 if self._reports.result is None else 10.0)
                 remove_file(self._out / "flight.pid")
                 if self._guardian is not None:
                     self._guardian.stop(GUARDIAN_EXIT_TIMEOUT_S)
         self._await_recorder()
-        return self._determine_outcome(process.returncode, log_path, sitl)
-
-    def _determine_outcome(self, code: int, log_path: Path, sitl: SitlProcess | None) -> Outcome:
-        """Determine the outcome from the messages and the exit code of the flight process, which has ended."""
-        guardian = self._guardian
-        expected: int | None
-        if self._refused is not None:
-            outcome, expected = Outcome.REFUSED, EXIT_CODES[Outcome.REFUSED]
-        elif guardian is not None and guardian.outcome is not None:
-            outcome, expected = guardian.outcome, None
-        elif self._result is not None and code >= 0:
-            outcome = self._result.outcome
-            expected = EXIT_CODES[outcome]
-        elif self._recorder_pid is None and self._stop_requested and -code in LAND_SIGNALS:
-            outcome, expected = Outcome.ABORTED, code  # Ctrl-C reached it directly, as in `run`
-        elif self._recorder_pid is None:
-            outcome, expected = Outcome.REFUSED, None  # it never started, so nothing was armed
-        else:
-            outcome, expected = Outcome.LOST, None
-        if sitl is not None and sitl.ended:
-            self._failures.append(sitl.exit_summary())
-        elif guardian is not None and guardian.took_over:
-            self._failures.append(self._takeover_summary(guardian, code, log_path))
-        elif code != expected:
-            self._failures.append(
-                f"flight: the flight process {how_it_ended(code)}{last_line(log_path)}; see {log_path}"
-            )
-        elif holds_traceback(log_path):
-            self._failures.append(f"flight: an internal error was logged{last_line(log_path)}; see {log_path}")
-        trouble = guardian.failure() if guardian is not None and (sitl is None or not sitl.ended) else None
-        if trouble is not None:
-            self._failures.append(trouble)
+        outcome = self._reports.outcome(
+            process.returncode, log_path, guardian, sitl, stop_requested=self._stop_requested
+        )
         # Without an answer from PX4 the vehicle may still be landing.
         if outcome in (Outcome.LOST, Outcome.ABORTED) and sitl is not None:
             sitl.wait_at_rest(time.monotonic() + SITL_SETTLE_TIMEOUT_S)
         return outcome
-
-    @staticmethod
-    def _takeover_summary(guardian: GuardianProcess, code: int, log_path: Path) -> str:
-        """Return one line on how the flight process and the flight ended."""
-        vehicle = {
-            Outcome.ABORTED: "the guardian landed the vehicle",
-            Outcome.CRASHED: "the vehicle was flipped or tipped over, and the guardian stopped its rotors",
-        }.get(guardian.outcome or Outcome.LOST, "the guardian could not confirm a landing")
-        hung = guardian.takeover is not None and guardian.takeover.hangs
-        what = "hung and was killed" if hung else f"{how_it_ended(code)}{last_line(log_path)}"
-        return f"flight: the flight process {what}; {vehicle}; see {log_path}"
-
-    def _user_lines(self, outcome: Outcome) -> tuple[str, ...]:
-        if outcome is not Outcome.REFUSED:
-            return tuple(self._failures)
-        reasons = self._refused
-        if reasons is None:
-            said = "; ".join(dict.fromkeys(self._px4_texts))
-            reasons = [
-                f"{text}; PX4 reported: {said}" if said and "PX4" in text else text
-                for tick, text in self._critical_events
-                if tick == self._critical_events[0][0]
-            ]
-        busy = () if self._cpu_contention.message is None else (self._cpu_contention.message,)
-        return (*reasons, *busy, *self._failures)
 
     def _watch(
         self,
@@ -337,7 +271,7 @@ class Launcher:
                     return
             for message in guardian.receive():
                 if isinstance(message, Unreadable):
-                    self._failures.append(f"guardian: an internal error: {message.text}")
+                    self._reports.failures.append(f"guardian: an internal error: {message.text}")
                 self._on_message(message)
                 self._check_cpu_contention(message)
             now_s = time.monotonic()
@@ -349,15 +283,15 @@ class Launcher:
             elif flight_open and process.poll() is not None:
                 self._receive(channel)  # its last messages may have come after `select`
                 flight_open = False
-            elif flight_open and self.flying and not guardian.took_over and self._silent(heard_s):
+            elif flight_open and self._reports.flying and not guardian.took_over and self._silent(heard_s):
                 text = f"flight: the flight process sent nothing for {FLIGHT_SILENT_TIMEOUT_S:g} s and was killed"
-                self._failures.append(text)
+                self._reports.failures.append(text)
                 process.kill()
             if flight_open:
                 flight_open_s = now_s
             alone_s = now_s - flight_open_s
             if guardian.hangs() or (not guardian.took_over and alone_s > GUARDIAN_EXIT_TIMEOUT_S):
-                self._failures.append("guardian: the guardian process hung and was killed")
+                self._reports.failures.append("guardian: the guardian process hung and was killed")
                 guardian.kill()
                 return
 
@@ -379,7 +313,7 @@ class Launcher:
             self._pace = (now_s - from_s) / (wall_s - from_wall_s)
 
     def _report_pace(self) -> None:
-        pace = None if self._time is None or not self.flying else self._time.pace()
+        pace = None if self._time is None or not self._reports.flying else self._time.pace()
         if pace is not None and self._speed is not None:
             self._on_message(Pace(pace, self._speed))
 
@@ -394,24 +328,9 @@ class Launcher:
         return True
 
     def _handle(self, message: Message) -> None:
-        match message:
-            case FlightEnded():
-                self._result = message
-            case RefusedFlight():
-                self._refused = message.lines
-            case Started():
-                self._recorder_pid = message.recorder_pid
-            case Status():
-                self._measure_pace()
-                self.flying = message.kind is not PhaseKind.DONE
-            case FlightEvent():
-                self._events.append(message.for_summary())
-                if message.ends_flight:
-                    self._critical_events.append((message.tick, message.text))
-            case Px4Text():
-                self._px4_texts.append(message.text)
-            case Unreadable():
-                self._failures.append(f"flight: an internal error: {message.text}")
+        self._reports.take(message)
+        if isinstance(message, Status):
+            self._measure_pace()
         self._on_message(message)
         self._check_cpu_contention(message)
 
@@ -431,23 +350,20 @@ class Launcher:
             action=SafetyAction.WARN,
             text=text,
         )
-        self._events.append(busy.for_summary())
+        self._reports.events.append(busy.for_summary())
 
     def _await_recorder(self) -> None:
         """Wait for the recorder to close the log if the flight process was killed. The recorder is not a child of this process,
         so its pidfd is polled.
         """
-        if self._recorder_pid is None or self._result is not None:
+        if self._reports.recorder_pid is None or self._reports.result is not None:
             return
         try:
-            pidfd = os.pidfd_open(self._recorder_pid)
+            pidfd = os.pidfd_open(self._reports.recorder_pid)
         except OSError:
             return
         select.select([pidfd], [], [], RECORDER_CLOSE_TIMEOUT_S)
         os.close(pidfd)
-
-
-LAND_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def replace_device_settings(config: FlightConfig, addresses: dict[str, dict[str, Any]]) -> FlightConfig:

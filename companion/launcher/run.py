@@ -12,7 +12,8 @@ from companion.analysis.contact import PROBE, contact_lines, write_probe
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.proposal import PROPOSAL, write_proposal
 from companion.analysis.summary import empty_summary, summarise, write_summary
-from companion.launcher.launcher import LAND_SIGNALS, FlightResult, Launcher, Sitl
+from companion.launcher.launcher import FlightResult, Launcher, Sitl
+from companion.launcher.reports import LAND_SIGNALS
 from companion.model.types import Outcome
 from companion.runtime.console import FlightDisplay, print_error, print_result
 from companion.runtime.subprocesses import LaunchError, signals_call

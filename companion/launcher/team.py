@@ -17,7 +17,8 @@ from rich.console import Console
 from companion.analysis.log import FlightLog
 from companion.analysis.pair import BarTruth, figures_of
 from companion.analysis.summary import write_summary
-from companion.launcher.launcher import LAND_SIGNALS, FlightResult, Launcher
+from companion.launcher.launcher import FlightResult, Launcher
+from companion.launcher.reports import LAND_SIGNALS
 from companion.launcher.run import report_of, summary_of
 from companion.launcher.sitl_process import SitlProcess
 from companion.model.codec import RecordError, from_jsonable

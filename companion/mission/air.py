@@ -11,10 +11,12 @@ from companion.control.manipulator import Manipulator
 from companion.mission.segments import Segment
 from companion.model.best_pose import best_pose
 from companion.model.codec import Record
+from companion.model.contact import ContactState
 from companion.model.frames import quat_rotate
 from companion.model.markers import BallState
+from companion.model.outputs import ChaseState, TetherState
 from companion.model.team import CarryState, ClampCommand, Grip
-from companion.model.types import ChaseState, ContactState, Inputs, MocapPose, Reference, TetherState, Vec3
+from companion.model.types import Inputs, MocapPose, Reference, Vec3
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 

@@ -83,7 +83,7 @@ class ArmCheck:
     def _fold_violations(self, position: Vec3, arm_rad: Joints, *, rests: bool) -> Iterator[Violation]:
         """Check that the arm can be folded from here; every landing after a fault begins with that."""
         fold = self._fold
-        away_rad = math.inf if fold is None else _farthest_rad(arm_rad, fold.from_rad)
+        away_rad = math.inf if fold is None else max(abs(a - b) for a, b in zip(arm_rad, fold.from_rad, strict=True))
         if fold is None or away_rad > (0.0 if rests else FOLD_STEP_RAD):
             fold = self._fold = self._clearance.fold(arm_rad)
         low_m = position[2] + fold.lowest_body_m
@@ -110,7 +110,3 @@ class ArmCheck:
 
 def _the(part: str) -> str:
     return part if part[-1].isdigit() else f"the {part}"
-
-
-def _farthest_rad(one_rad: Joints, other_rad: Joints) -> float:
-    return max(abs(a - b) for a, b in zip(one_rad, other_rad, strict=True))

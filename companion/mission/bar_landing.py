@@ -65,7 +65,7 @@ def landing_with_bar(
     begun_s = builder.t_s
     builder.t_s = builder.descend(speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
     _segment(builder, "land", begun_s)
-    return Plan.of("landing", builder), opens_s
+    return Plan.of(builder), opens_s
 
 
 def _segment(builder: PlanBuilder, name: str, begun_s: float) -> None:

@@ -34,7 +34,6 @@ BACK_MIN_S = 1.0
 class Plan:
     """The segments from 0 to `duration_s` and their motion. `Plan.build` and `landing_from` build it."""
 
-    name: str
     segments: tuple[Segment, ...]
     """Segments without gaps. A repeated mission has two repetitions here; `segment` computes the others."""
     duration_s: float
@@ -88,10 +87,10 @@ class Plan:
                 )
             )
         repeats = repeats_of(mission, builder.segments, tuple([phase.title for phase in phases[1:-1]]))
-        return cls.of(mission.name, builder, repeats)
+        return cls.of(builder, repeats)
 
     @classmethod
-    def of(cls, name: str, builder: PlanBuilder, repeats: Repeats | None = None) -> Plan:
+    def of(cls, builder: PlanBuilder, repeats: Repeats | None = None) -> Plan:
         """Return the plan of a builder's segments and tracks. Its second repetition is replayed in place of all later ones."""
         segments, left_out_s = builder.segments, 0.0
         starts_s = tuple(segment.start_s for segment in segments)
@@ -101,7 +100,6 @@ class Plan:
             segments = [*earlier, replace(last, start_s=repeats.end_s, end_s=last.end_s + left_out_s)]
         position, yaw, arm = builder.tracks()
         return cls(
-            name=name,
             segments=tuple(segments),
             duration_s=builder.t_s + left_out_s,
             _starts_s=starts_s,
@@ -199,7 +197,7 @@ def landing_from(
     end_s = builder.descend(speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
     builder.t_s = max(end_s, back_s + fold_s)
     builder.segments.append(Segment(name="land", kind=PhaseKind.LANDING, start_s=start_s, end_s=builder.t_s, index=-1))
-    return Plan.of("landing", builder)
+    return Plan.of(builder)
 
 
 def go_back(builder: PlanBuilder, to_m: Vec3, kind: PhaseKind) -> Vec3:

@@ -88,7 +88,7 @@ def retract_from(
         Segment(name="return", kind=PhaseKind.FLIGHT, start_s=segments[0].end_s, end_s=builder.t_s, index=-1)
     )
     builder.segments += segments
-    return Plan.of("retract", builder)
+    return Plan.of(builder)
 
 
 def _never_outward(velocity_m_s: Vec3, duration_s: float, position_m: Vec3, anchor_m: Vec3) -> Vec3:

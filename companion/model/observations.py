@@ -178,8 +178,6 @@ class Observations(Record, frozen=True, kw_only=True):
     """Statement of the plug-in that drives the arm; None for servos."""
     force: tuple[ForceSample, ...] = ()
     machine: Machine | None = None
-    broker: str | None = None
-    """Reason why the broker did not answer; empty if it did, None if no broker is configured."""
     hand_test: str | None = None
     """The recorded hand test of this setup; empty if there is none, None if no hand test is required."""
     hand_test_changed: str = ""

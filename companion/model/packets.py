@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from companion.model.codec import Record, from_packet
-from companion.model.types import Inputs, OperatorCommand, Outputs, SafetyAction, Sent, Severity
+from companion.model.outputs import Outputs, Sent
+from companion.model.types import Inputs, OperatorCommand, SafetyAction, Severity
 
 
 class Tick(Record, frozen=True, kw_only=True, tag=True):

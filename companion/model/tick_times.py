@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from companion.model.types import Inputs, Sent
+from companion.model.outputs import Sent
+from companion.model.types import Inputs
 
 
 class TickTimes:

@@ -161,9 +161,9 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
     else:
         yield MODEL.good(read, wanted)
     yield firmware(FIRMWARE, [(kind, servo.firmware) for servo, kind in zip(servos, kinds, strict=True)])
-    modes = [_mode(servo.operating_mode) for servo in servos]
+    modes = [mode_text(servo.operating_mode) for servo in servos]
     fix = "another program has changed it: close that program, then cycle the servos' power"
-    yield _equal(MODE, modes, _mode(MODE_CURRENT), fix)
+    yield _equal(MODE, modes, mode_text(MODE_CURRENT), fix)
     delays = [f"{servo.return_delay_us} us" for servo in servos]
     yield _equal(RETURN_DELAY, delays, "0 us", "another program has changed it: close that program, then start again")
     watchdogs = [f"{servo.watchdog_ms} ms" for servo in servos]
@@ -285,5 +285,6 @@ def _each(values: Sequence[object]) -> str:
     return str(values[0]) if len(set(values)) == 1 else " and ".join(map(str, values))
 
 
-def _mode(mode: int) -> str:
+def mode_text(mode: int) -> str:
+    """Return an operating mode with its name."""
     return f"{mode} ({MODES.get(mode, 'unknown')})"

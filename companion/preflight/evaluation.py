@@ -62,4 +62,4 @@ def unsettled(o: Observations, config: FlightConfig) -> Waiting | None:
 
 def param_names(vehicle: Vehicle) -> tuple[str, ...]:
     """Return the PX4 parameters that the rows need."""
-    return (*required.names(), required.KILL_CHANNEL, *rotors.names(vehicle.airframe.rotor_layout.count))
+    return (*required.BY_NAME, required.KILL_CHANNEL, *rotors.names(vehicle.airframe.rotor_layout.count))

@@ -8,9 +8,10 @@ from collections.abc import Iterator, Mapping
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Level, Row
 from companion.preflight.checks import Check
-from companion.px4.required import ROTOR_COUNT, WANTED, Value, Wanted
+from companion.px4.required import ROTOR_COUNT, WANTED
 from companion.px4.rotors import differences
 from companion.px4.versions import KNOWN_GOOD, OLDEST, varies
+from companion.px4.wanted import Value, Wanted
 
 ROTORS = Check(
     "px4.rotors",

@@ -7,13 +7,11 @@ metadata of PX4 1.16.1 and 1.18; `companion.px4.versions` says which versions ha
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Level
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.flight_stage import SPOOL_S
+from companion.px4.wanted import Value, Wanted, between
 
 HOVER = "MPC_THR_HOVER"
 ROTOR_COUNT = "CA_ROTOR_COUNT"
@@ -24,73 +22,6 @@ KILL_CHANNEL = "RC_MAP_KILL_SW"
 _HOVER_OFF_MAX = 0.35
 _ROOM_MARGIN_M = 0.3
 _FAILURE_MARGIN_DEG = 10.0
-_RELATIVE = 1e-6
-
-Value = float | int
-Limits = Callable[[Vehicle], tuple[float, float]]
-
-
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """One parameter. The values in `ok` or within `limits` are accepted; if neither is set, only `value` is accepted."""
-
-    name: str
-    value: Value | None
-    """Value in the parameter file, in PX4's type: int for INT32, float for REAL32. None if it is measured on each vehicle."""
-    why: str
-    """Consequence of a wrong value, or meaning of the values."""
-    level: Level = Level.REFUSE
-    reboot: bool = False
-    ok: tuple[int, ...] = ()
-    limits: Limits | None = None
-    limits_text: str = ""
-    """Description of the limits, if they depend on the vehicle file."""
-    fix: str = ""
-    """Remedy, if it is not simply to set the parameter."""
-    hardware: bool = False
-    """Whether the parameter belongs to the serial port TELEM2. Such parameters are checked only on a serial link, because PX4's
-    simulator lacks some of them.
-    """
-    file: bool = True
-    """Whether the parameter is in configs/px4/indoor_mocap.params."""
-    measured: bool = False
-    """Whether the value is measured on each installation. If so, a value within `limits` other than PX4's default is left unchanged."""
-
-    @property
-    def integer(self) -> bool:
-        """Whether PX4 stores the parameter as an INT32."""
-        return isinstance(self.value, int)
-
-    def accepts(self, value: Value, vehicle: Vehicle) -> bool:
-        """Return whether this vehicle can fly with the value in PX4."""
-        if self.ok:
-            return value in self.ok
-        if self.limits is None:
-            assert self.value is not None
-            low = high = float(self.value)
-        else:
-            low, high = self.limits(vehicle)
-        slack = _RELATIVE * max(abs(low), abs(high), _RELATIVE)
-        return low - slack <= value <= high + slack
-
-    def text(self, vehicle: Vehicle | None = None) -> str:
-        """Return the accepted values for display. Without a vehicle, limits that depend on it are described in words."""
-        if self.ok:
-            return " or ".join(f"{value}" for value in self.ok)
-        if self.limits is None:
-            return f"{self.value:g}"
-        if vehicle is None and self.limits_text:
-            return self.limits_text
-        low, high = self.limits(vehicle) if vehicle is not None else self.limits(NO_VEHICLE)
-        return " to ".join(f"{end:.3f}".rstrip("0").rstrip(".") for end in (low, high))
-
-
-NO_VEHICLE: Vehicle = None  # type: ignore[assignment]
-"""Placeholder vehicle for limits that do not depend on it."""
-
-
-def _between(low: float, high: float) -> Limits:
-    return lambda _: (low, high)
 
 
 def _hover(vehicle: Vehicle) -> tuple[float, float]:
@@ -156,12 +87,12 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             5.0,
             "delay from exposure to arrival, ms; if it is wrong, the estimate oscillates with the vehicle's motion",
             reboot=True,
-            limits=_between(0.0, 30.0),
+            limits=between(0.0, 30.0),
             measured=True,
         ),
-        Wanted("EKF2_ASP_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=_between(0.0, 50.0)),
-        Wanted("EKF2_GPS_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=_between(0.0, 50.0)),
-        *(Wanted(f"SENS_GPS{n}_DELAY", 5, _RAISES, _WARN, reboot=True, limits=_between(0.0, 50.0)) for n in (0, 1)),
+        Wanted("EKF2_ASP_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=between(0.0, 50.0)),
+        Wanted("EKF2_GPS_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=between(0.0, 50.0)),
+        *(Wanted(f"SENS_GPS{n}_DELAY", 5, _RAISES, _WARN, reboot=True, limits=between(0.0, 50.0)) for n in (0, 1)),
         Wanted(
             "EKF2_DELAY_MAX",
             50.0,
@@ -169,22 +100,22 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "EKF2_TAU_POS and EKF2_TAU_VEL), the estimate drifts by 3 to 4 mm",
             _WARN,
             reboot=True,
-            limits=_between(30.0, 60.0),
+            limits=between(30.0, 60.0),
         ),
-        *(Wanted(f"EKF2_TAU_{of}", 0.1, _FOLLOWS, _WARN, limits=_between(0.1, 0.15)) for of in ("POS", "VEL")),
+        *(Wanted(f"EKF2_TAU_{of}", 0.1, _FOLLOWS, _WARN, limits=between(0.1, 0.15)) for of in ("POS", "VEL")),
         Wanted(
             "EKF2_EVP_NOISE",
             0.01,
             "noise of the position, m; if it is much larger, the estimate follows the drift of the IMU instead of motion capture",
             _WARN,
-            limits=_between(0.005, 0.05),
+            limits=between(0.005, 0.05),
         ),
         Wanted(
             "EKF2_EVA_NOISE",
             0.05,
             "noise of the attitude, rad; if it is much larger, yaw lags behind motion capture",
             _WARN,
-            limits=_between(0.01, 0.1),
+            limits=between(0.01, 0.1),
         ),
         Wanted(
             "EKF2_EV_QMIN",
@@ -196,7 +127,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
                 f"EKF2_EV_POS_{axis}",
                 0.0,
                 "offset of the body's pivot from PX4's centre of mass, m; it shifts the estimate when the vehicle tilts",
-                limits=_between(-0.02, 0.02),
+                limits=between(-0.02, 0.02),
             )
             for axis in "XYZ"
         ),
@@ -213,7 +144,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "natural frequency of the model that attitude setpoints pass, rad/s; with PX4's 50 they lag by 40 ms, and the attitude "
             "error doubles (3.0 instead of 1.6 deg in the catch)",
             _WARN,
-            limits=_between(150.0, 1000.0),
+            limits=between(150.0, 1000.0),
         ),
     ),
     "Loss of the companion": (
@@ -222,7 +153,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             0.5,
             "time without a setpoint until the failsafe, s; if longer, the vehicle continues at its last attitude; if shorter, "
             "one delayed packet ends the flight",
-            limits=_between(0.2, 0.5),
+            limits=between(0.2, 0.5),
         ),
         Wanted(
             "COM_OBL_RC_ACT",
@@ -244,7 +175,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             0.5,
             "time from the kill switch until PX4 disarms, s; a switch that is released before starts the rotors again, and PX4's "
             "own landing, which the fall has misled, may lift the vehicle",
-            limits=_between(0.0, 1.0),
+            limits=between(0.0, 1.0),
         ),
         Wanted(
             "NAV_RCL_ACT",
@@ -346,26 +277,26 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "COM_SPOOLUP_TIME",
             1.0,
             "time after arming for which PX4 limits the thrust, s, while the companion spools up",
-            limits=_between(0.0, SPOOL_S),
+            limits=between(0.0, SPOOL_S),
         ),
         Wanted(
             "COM_DISARM_LAND",
             2.0,
             "time from PX4's own landing until it disarms, s; if it is 0 or less, the rotors continue to turn",
-            limits=_between(0.1, 5.0),
+            limits=between(0.1, 5.0),
         ),
         Wanted(
             "COM_DISARM_PRFLT",
             10.0,
             "time after arming within which the vehicle must take off, s; if it is too short, PX4 disarms during spool-up",
-            limits=_between(5.0, 60.0),
+            limits=between(5.0, 60.0),
         ),
         Wanted(
             "MPC_LAND_SPEED",
             0.7,
             "descent speed of PX4's own landing, m/s; the net touches down first",
             _WARN,
-            limits=_between(0.3, 1.0),
+            limits=between(0.3, 1.0),
         ),
         Wanted(
             "MIS_TAKEOFF_ALT",
@@ -382,7 +313,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             25.0,
             "tilt limit of PX4's own modes, deg; if larger, PX4 may cross the room fast after a takeover",
             _WARN,
-            limits=_between(20.0, 45.0),
+            limits=between(20.0, 45.0),
         ),
         Wanted(
             "MPC_ACC_HOR",
@@ -390,28 +321,28 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "acceleration, m/s^2; if it is smaller, LAND stops further ahead (0.53 m after a takeover with PX4's default of 3); "
             "MPC_JERK_AUTO and MPC_TILTMAX_AIR keep the actual acceleration below it",
             _WARN,
-            limits=_between(5.0, 10.0),
+            limits=between(5.0, 10.0),
         ),
         Wanted(
             "MPC_JERK_AUTO",
             6.0,
             "jerk, m/s^3; if smaller, PX4 brakes later; if larger, LAND approaches its stop point faster",
             _WARN,
-            limits=_between(4.0, 8.0),
+            limits=between(4.0, 8.0),
         ),
         Wanted(
             "MPC_XY_VEL_MAX",
             2.0,
             "horizontal speed, m/s; if larger, there is not enough distance to stop",
             _WARN,
-            limits=_between(0.5, 3.0),
+            limits=between(0.5, 3.0),
         ),
         Wanted(
             "MPC_Z_VEL_MAX_UP",
             1.0,
             "climb speed, m/s; if larger, there is not enough distance to stop below the ceiling",
             _WARN,
-            limits=_between(0.5, 2.0),
+            limits=between(0.5, 2.0),
         ),
     ),
     "Serial link to the companion: TELEM2": (
@@ -438,7 +369,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             _WARN,
             reboot=True,
             hardware=True,
-            limits=_between(60000.0, 92160.0),
+            limits=between(60000.0, 92160.0),
         ),
         Wanted(
             "SER_TEL2_BAUD",
@@ -456,11 +387,6 @@ WANTED: tuple[Wanted, ...] = tuple(one for group in GROUPS.values() for one in g
 BY_NAME = {one.name: one for one in WANTED}
 
 
-def names() -> tuple[str, ...]:
-    """Return the names of all parameters that the preflight check reads."""
-    return tuple(BY_NAME)
-
-
 def file_values() -> dict[str, Value]:
     """Return the content of configs/px4/indoor_mocap.params."""
     return {one.name: one.value for one in WANTED if one.file and one.value is not None}
@@ -468,5 +394,4 @@ def file_values() -> dict[str, Value]:
 
 def simulated_values() -> dict[str, Value]:
     """Return the parameters of a simulated PX4 by name: those of the file, but without the serial port and for no radio."""
-    values = {one.name: one.value for one in WANTED if one.file and not one.hardware and one.value is not None}
-    return {**values, RADIO: NO_RADIO}
+    return {name: value for name, value in file_values().items() if not BY_NAME[name].hardware} | {RADIO: NO_RADIO}

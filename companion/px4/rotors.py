@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from companion.config.airframe import Airframe
 from companion.model.rotors import CCW, RotorLayout
-from companion.px4.required import Value
+from companion.px4.wanted import Value
 
 AWAY_MAX = 0.25
 """Largest distance of a rotor in PX4 from its place in the vehicle file, as a fraction of the mean rotor arm. Of eight rotors on a

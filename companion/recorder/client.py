@@ -25,16 +25,9 @@ from typing import Any
 from companion.io.protocols import DeviceError
 from companion.model.codec import to_packet
 from companion.model.commands import COMMANDS
+from companion.model.outputs import Outputs, Sent
 from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Packet, Tick
-from companion.model.types import (
-    GroundCommand,
-    Inputs,
-    OperatorCommand,
-    Outputs,
-    SafetyAction,
-    Sent,
-    Severity,
-)
+from companion.model.types import GroundCommand, Inputs, OperatorCommand, SafetyAction, Severity
 from companion.runtime import simulated_time
 from companion.runtime.subprocesses import JsonLines
 

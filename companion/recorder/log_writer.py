@@ -16,7 +16,8 @@ from foxglove.messages import Log, LogLevel
 
 from companion.ground.protocol.messages import EventLine
 from companion.model.codec import Record, json_schema, to_json
-from companion.model.types import Event, Inputs, Outputs, Sent
+from companion.model.outputs import Outputs, Sent
+from companion.model.types import Event, Inputs
 from companion.recorder.live_viewers import LiveViewers, in_log
 from companion.recorder.log_file import LogFile
 from companion.recorder.viewer_channels import ViewerChannels, timestamp

@@ -25,8 +25,9 @@ from pathlib import Path
 from typing import Any
 
 from companion.model.codec import RecordError, fingerprint
+from companion.model.outputs import Outputs, Sent
 from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Tick, read_packet
-from companion.model.types import Inputs, Outputs, Sent
+from companion.model.types import Inputs
 from companion.recorder.channel import FLUSH_PERIOD_S, Channel
 from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter

@@ -43,7 +43,8 @@ from companion.model.frames import quat_rotate
 from companion.model.hanging_line import hanging_line_m
 from companion.model.logged_geometry import Geometry, logged_geometry
 from companion.model.markers import BallState
-from companion.model.types import Inputs, Outputs, Quat, Reference, TetherState, Vec3
+from companion.model.outputs import Outputs, TetherState
+from companion.model.types import Inputs, Quat, Reference, Vec3
 from companion.recorder.viewer_scene import (
     BALL,
     BALL_M,

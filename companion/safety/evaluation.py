@@ -8,7 +8,8 @@ from typing import Any
 
 from companion.config.vehicle import Vehicle
 from companion.model.negative_zero import without_negative_zero
-from companion.model.types import ActiveRule, Event, SafetyAction
+from companion.model.outputs import ActiveRule
+from companion.model.types import Event, SafetyAction
 from companion.safety.flight_context import Values
 from companion.safety.rule import Repeat, Rule, Subject, hold_time_s, thresholds_of
 from companion.safety.rules import RULES

@@ -11,7 +11,8 @@ import math
 from companion.config.vehicle import Vehicle
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import tilt_rad
-from companion.model.types import ControlLog, Inputs, TetherState, VehicleState
+from companion.model.outputs import ControlLog, TetherState
+from companion.model.types import Inputs, VehicleState
 from companion.safety.flight_context import FlightContext, Values
 from companion.safety.governor import BODY_TOP_M
 from companion.safety.oscillation import Oscillation

@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
+from companion.model.outputs import ControlLog, TetherState
 from companion.model.team import Grip
-from companion.model.types import ControlLog, TetherState, Vec3
+from companion.model.types import Vec3
 
 Values = tuple[object, ...]
 """Values for a rule's message, returned by a predicate whose condition holds."""

@@ -20,7 +20,8 @@ from typing import Final
 from companion.config.mission import Limits
 from companion.config.vehicle import Vehicle
 from companion.model.codec import Record
-from companion.model.types import Reference, TetherState, Vec3
+from companion.model.outputs import TetherState
+from companion.model.types import Reference, Vec3
 from companion.safety.stop import StopModel
 
 BODY_TOP_M: Final = 0.15

@@ -10,7 +10,8 @@ from typing import Final
 import msgspec
 
 from companion.config.vehicle import Vehicle
-from companion.model.types import ActiveRule, Event, Inputs, MocapPose, VehicleState
+from companion.model.outputs import ActiveRule
+from companion.model.types import Event, Inputs, MocapPose, VehicleState
 from companion.safety.arm import ArmTracker, ForceTracker
 from companion.safety.evaluation import Evaluation
 from companion.safety.flight import FlightTracker

@@ -71,7 +71,9 @@ def partner_lands(t: TeamTracker, _: None) -> Values | None:
 
 def partner_let_go(t: TeamTracker, _: None) -> Values | None:
     """Fires if the other vehicle has let go of a bar that is in the air."""
-    return HOLDS if t.said is not None and t.said.grip is Grip.FREE and t.grip is Grip.CARRYING else None
+    if t.said is None or t.said.px4_lands:
+        return None
+    return HOLDS if t.said.grip is Grip.FREE and t.grip is Grip.CARRYING else None
 
 
 def partner_near(t: TeamTracker, radius_m: float) -> Values | None:

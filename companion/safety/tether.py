@@ -13,7 +13,8 @@ from typing import Final
 from companion.config.tether import Tether
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_rotate
-from companion.model.types import Joints, Quat, TetherState, Vec3
+from companion.model.outputs import TetherState
+from companion.model.types import Joints, Quat, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether_pull import PullEstimate
 from companion.safety.tether_shape import Clearance, steepest_slope
@@ -39,11 +40,6 @@ def distance_m(tether: Tether, position_world_m: Vec3, attitude_wxyz: Quat) -> f
 def slack_m(tether: Tether, position_world_m: Vec3, attitude_wxyz: Quat) -> float:
     """Return the tether length that is left, m; 0 if the tether is taut."""
     return tether.length_m - distance_m(tether, position_world_m, attitude_wxyz)
-
-
-def allowed_m(tether: Tether) -> float:
-    """Return the largest distance from the anchor that a plan may use, m."""
-    return tether.length_m - tether.margin_m
 
 
 class Winding:

@@ -72,7 +72,7 @@ def _flown(config: FlightConfig, plan: Plan, phase: Phase, segment: Segment, lab
     """Return the states and the reports of a phase for random inputs, the same on every call."""
     history: list[object] = []
     own: Record | None = None
-    for k, observation in enumerate(_random_observations(config, plan, segment)):
+    for k, observation in enumerate(_random_observations(plan, segment)):
         air = _Still(config, plan, segment, observation)
         own = phase.begin(air) if k == 0 else phase.step(air, own)
         history += [own, *air.reports]
@@ -87,7 +87,7 @@ def _flown(config: FlightConfig, plan: Plan, phase: Phase, segment: Segment, lab
     return tuple(history)
 
 
-def _random_observations(config: FlightConfig, plan: Plan, segment: Segment) -> Iterator[Observation]:
+def _random_observations(plan: Plan, segment: Segment) -> Iterator[Observation]:
     draw = random.Random(1)
     reference = plan.reference(segment.start_s)
 

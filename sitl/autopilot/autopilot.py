@@ -147,11 +147,6 @@ class Px4Stub:
         """Whether the position controller computes the attitude target."""
         return self._climb_rate_controlled
 
-    @property
-    def home_set(self) -> bool:
-        """Whether the home position is known, locally and globally."""
-        return self.home_ned_m is not None and self.origin is not None
-
     def step(self, imu: ImuSample) -> RotorCommands:
         """Advance to the sample's world time and return normalised rotor commands (0 to 1); all are zero while disarmed."""
         t_s = imu.t_s

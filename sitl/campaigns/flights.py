@@ -14,7 +14,8 @@ import numpy as np
 from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.config.loader import FlightConfig
-from companion.model.types import Event, Inputs, Outcome, Outputs, SafetyAction, Sent, Severity
+from companion.model.outputs import Outputs, Sent
+from companion.model.types import Event, Inputs, Outcome, SafetyAction, Severity
 from companion.sitl_config.distributions import draw
 from companion.sitl_config.loader import SitlConfig
 from companion.sitl_config.world import World

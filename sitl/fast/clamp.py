@@ -40,6 +40,6 @@ class FastClamp:
         if command is None or command is self._command:
             return
         self._command = command
-        angle_deg = self._jaws.open_deg if command is ClampCommand.OPEN else self._jaws.closed_deg
+        angle_deg = self._jaws.open_deg if command is ClampCommand.OPEN else self._jaws.empty_deg
         self.drive.goal_position_counts = round(math.radians(angle_deg) / RAD_PER_COUNT)
         self.drive.torque_on = True

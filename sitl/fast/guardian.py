@@ -18,7 +18,8 @@ from companion.guardian.link import Link
 from companion.guardian.monitors import StallWatch
 from companion.guardian.process import PERIOD_S
 from companion.guardian.takeover_landing import Notice, Notify, TakeoverLanding
-from companion.model.types import Event, Inputs, LinkIdentity, MocapPose, Outputs, SafetyAction, Severity
+from companion.model.outputs import Outputs
+from companion.model.types import Event, Inputs, LinkIdentity, MocapPose, SafetyAction, Severity
 from companion.safety.mocap import limits_of
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.receive import Receiver

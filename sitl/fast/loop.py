@@ -26,6 +26,7 @@ from companion.model.frames import (
     ned_from_enu,
 )
 from companion.model.markers import MarkerFrame
+from companion.model.outputs import Outputs
 from companion.model.team import BarPose, Grip, PartnerState, TeamState
 from companion.model.types import (
     AutopilotRequest,
@@ -36,7 +37,6 @@ from companion.model.types import (
     LandedState,
     MocapPose,
     OperatorCommand,
-    Outputs,
     Quat,
     Vec3,
     VehicleState,

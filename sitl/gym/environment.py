@@ -18,7 +18,7 @@ from companion.config.vehicle import Vehicle
 from companion.control.policy import SteeredLaw, action_names, observation_bounds
 from companion.control.types import Law
 from companion.model.constants import TICK_PERIOD_S
-from companion.model.types import Outputs
+from companion.model.outputs import Outputs
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import Flown, with_world
 from sitl.campaigns.tune import graded

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 import mujoco
 
-from companion.model.algebra import mat_vec
+from companion.model.algebra import mat_vec, plus
 from companion.model.frames import quat_rotate
 from companion.model.types import Quat, Vec3
 from companion.phases.carry.bar import Bar as PlannedBar
@@ -133,13 +133,15 @@ class Bar:
         self._was_falling_m_s = speed_m_s
         self._watch_rotors(t_s)
 
+    def is_near(self, number: int) -> bool:
+        """Return whether a machine's handle is between its jaws."""
+        at = plus(vec3_of(self._at), mat_vec(mat3_of(self._axes), self._handles[number]))
+        return math.dist(at, vec3_of(self._tips[number])) <= self._true.capture_m
+
     def _take(self, number: int, t_s: float) -> None:
-        at, axes, handle = vec3_of(self._at), mat3_of(self._axes), self._handles[number]
-        world = tuple(a + b for a, b in zip(at, mat_vec(axes, handle), strict=True))
-        tip = vec3_of(self._tips[number])
-        if math.dist(world, tip) > self._true.capture_m:
+        if not self.is_near(number):
             return
-        clamp = self._clamps[number]
+        clamp, handle = self._clamps[number], self._handles[number]
         self._model.eq_data[clamp, 0:3] = 0.0
         self._model.eq_data[clamp, 3:6] = handle
         self._data.eq_active[clamp] = 1

@@ -34,18 +34,20 @@ class Jaws:
         self._open_rad, self._closed_rad = math.radians(config.open_deg), math.radians(config.closed_deg)
         self._nm_per_a = SERVOS[config.servo].torque_per_amp_nm_a
         self.angle_rad, self.rate_rad_s = self._open_rad, 0.0
+        self.closed = False
+        """Whether the jaws are closed around a handle."""
 
-    def step(self, t_s: float) -> None:
-        """Move the shaft by one physics step."""
+    def step(self, t_s: float, handle_near: bool) -> None:
+        """Move the shaft by one physics step; a handle between the jaws stops them."""
         torque_nm = self._drive.update(t_s, self.angle_rad, self.rate_rad_s) * self._nm_per_a
         rate = self.rate_rad_s + PHYSICS_DT_S * torque_nm / _INERTIA_KG_M2
         rate -= math.copysign(min(abs(rate), PHYSICS_DT_S * _FRICTION_NM / _INERTIA_KG_M2), rate)
         angle = self.angle_rad + PHYSICS_DT_S * rate
-        beyond = (angle - self._closed_rad) * (self._closed_rad - self._open_rad) > 0.0
-        self.angle_rad, self.rate_rad_s = (self._closed_rad, 0.0) if beyond else (angle, rate)
-
-    @property
-    def closed(self) -> bool:
-        """Whether the jaws hold a handle that is between them."""
-        away = abs(self.angle_rad - self._closed_rad)
-        return away <= _GRIPPED_SHARE * abs(self._open_rad - self._closed_rad)
+        way_rad = self._closed_rad - self._open_rad
+        beyond = (angle - self._closed_rad) / way_rad
+        was_open = (self.angle_rad - self._closed_rad) / way_rad < 0.0
+        if beyond >= 0.0 and (self.closed or (was_open and handle_near)):
+            angle, rate, self.closed = self._closed_rad, 0.0, True
+        elif self.closed and beyond < -_GRIPPED_SHARE:
+            self.closed = False
+        self.angle_rad, self.rate_rad_s = angle, rate

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from companion.analysis.pair import PairFigures, carries
+from companion.model.outputs import Outputs
 from companion.model.team import CarryState
-from companion.model.types import Outputs
 from sitl.world.scene import Scene
 
 

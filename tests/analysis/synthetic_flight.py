@@ -14,12 +14,12 @@ import msgspec
 
 from companion.analysis.log import FlightLog
 from companion.model.frames import quat_from_euler_zyx
+from companion.model.outputs import ControlLog, Outputs, Sent
 from companion.model.types import (
     ArmState,
     AttitudeSetpoint,
     AutopilotRequest,
     AutopilotStatus,
-    ControlLog,
     Event,
     FlightMode,
     ForceSample,
@@ -29,11 +29,9 @@ from companion.model.types import (
     MocapPose,
     OperatorCommand,
     Outcome,
-    Outputs,
     PhaseKind,
     Reference,
     SafetyAction,
-    Sent,
     Severity,
     Vec3,
     VehicleState,

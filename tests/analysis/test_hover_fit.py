@@ -12,7 +12,8 @@ import pytest
 
 from companion.analysis.hover_fit import FIT_MIN_S, SLOPE_MIN_V, HoverFitError, fit_hover_thrust
 from companion.analysis.log import FlightLog
-from companion.model.types import Inputs, Outputs
+from companion.model.outputs import Outputs
+from companion.model.types import Inputs
 from sitl.campaigns.flights import log_of
 from tests.control.test_hover import configured, flown, true_hover_thrust
 

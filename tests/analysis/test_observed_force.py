@@ -7,7 +7,8 @@ from msgspec.structs import replace
 
 from companion.analysis import metrics
 from companion.analysis.log import FlightLog
-from companion.model.types import Outputs, PhaseKind, Vec3
+from companion.model.outputs import Outputs
+from companion.model.types import PhaseKind, Vec3
 from tests.analysis.synthetic_flight import log_of_rows, synthetic_flight
 
 

@@ -28,9 +28,7 @@ class Flights:
 
 
 def fly_made_up(
-    monkeypatch: pytest.MonkeyPatch,
-    row_of: Callable[[dict[str, Any]], Row | None],
-    error: CampaignError | None = None,
+    monkeypatch: pytest.MonkeyPatch, row_of: Callable[[dict[str, Any]], Row | None], error: CampaignError | None = None
 ) -> None:
     """Let `row_of` make the row of each flight of a job, or None for one that is not flown."""
 

@@ -7,15 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.campaigns.robustness.cases import (
-    Cases,
-    Kept,
-    as_cases,
-    fly_command,
-    read_cases,
-    worse_than,
-    write_cases,
-)
+from companion.campaigns.robustness.cases import Cases, Kept, as_cases, fly_command, read_cases, worse_than, write_cases
 from companion.campaigns.robustness.draws import influence, sensor_of, thirds, worst
 from companion.campaigns.robustness.plots import write_distribution
 from companion.campaigns.runner import Row

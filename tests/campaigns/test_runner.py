@@ -107,10 +107,7 @@ def test_a_campaign_that_breaks_off_keeps_what_was_flown(monkeypatch: pytest.Mon
     fly_made_up(monkeypatch, lambda flight: fault_row(flight) if flight["size"] != 85.0 else None, error)
     ended = run_here("faults", str(CATCH), "--kinds", "servo_hot", "--phases", "line", "--out", "out", "--json")
     assert ended.code == EXIT_LOST
-    assert ended.err_lines == [
-        "companion faults: a worker process died",
-        "companion faults: 1 of 2 flights were flown",
-    ]
+    assert ended.err_lines == ["companion faults: a worker process died", "companion faults: 1 of 2 flights were flown"]
     assert [row["size"] for row in json.loads(ended.out)["rows"]] == [70.0]
     assert json.loads(Path("out/faults.json").read_text())["notes"] == [
         "a worker process died", "1 of 2 flights were flown"

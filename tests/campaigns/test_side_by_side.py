@@ -20,7 +20,8 @@ from companion.campaigns.side_by_side.comparison import Comparison, Figure, NotA
 from companion.campaigns.side_by_side.flight import Flight, flight_of
 from companion.campaigns.side_by_side.page import write_html
 from companion.campaigns.side_by_side.plots import write_pictures
-from companion.model.types import Event, Inputs, Outputs, SafetyAction, Sent, Severity
+from companion.model.outputs import Outputs, Sent
+from companion.model.types import Event, Inputs, SafetyAction, Severity
 from tests.analysis.synthetic_flight import (
     CATCH_S,
     CONFIG,

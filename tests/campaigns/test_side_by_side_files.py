@@ -14,10 +14,7 @@ from companion.cli.main import main
 from companion.cli.report import names_of
 from companion.launcher import run as flight_module
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from tests.analysis.synthetic_flight import (
-    LANDED_S,
-    record_flight,
-)
+from tests.analysis.synthetic_flight import LANDED_S, record_flight
 from tests.campaigns.test_side_by_side import IN_WORLD, configured
 
 

@@ -22,7 +22,8 @@ from companion.io.devices import open_available
 from companion.model.exit_codes import EXIT_REFUSED
 from companion.runtime.clock import flight_clock
 from companion.runtime.event_loop import run
-from tests.support import CATCH, Ended, Sandbox, World, read_summary, sandbox_in, serial_line, set_options
+from tests.support import CATCH, Ended, Sandbox, World, read_summary, sandbox_in, set_options
+from tests.wires import serial_line
 
 """Tests that share one world run in one process."""
 QUICK = {"discovery_timeout_s": 1.0}

@@ -11,15 +11,7 @@ import numpy as np
 import pytest
 
 from companion.commissioning.latency import fit as latency_fit
-from companion.commissioning.latency.fit import (
-    Tap,
-    TapDelay,
-    agreeing,
-    combine,
-    find_taps,
-    measure_tap,
-    mocap_noise,
-)
+from companion.commissioning.latency.fit import Tap, TapDelay, agreeing, combine, find_taps, measure_tap, mocap_noise
 from companion.commissioning.latency.tools import Measured, rows, text
 from companion.model.types import Quat, Vec3
 from companion.preflight.hand_test.motion import ImuAt, PoseAt

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from companion.config.controller import AdaptiveConfig, PscConfig, fitted
+from companion.config.controller import AdaptiveConfig, PscConfig
 from companion.config.document import ConfigError
+from companion.config.gains import fitted
 from companion.config.loader import load_flight
 from tests.support import CATCH
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from companion.config.controller import LAWS, AdaptiveConfig
+from companion.config.controller import LAWS, PRESETS, AdaptiveConfig
 from companion.config.document import ConfigError
-from companion.config.loader import PRESETS, FlightConfig, load_flight, load_vehicle, logged_flight
+from companion.config.loader import FlightConfig, load_flight, load_vehicle, logged_flight
 from companion.model.link_address import parse_address
 from companion.sitl_config.loader import SitlConfig, load_sitl, load_world
 from tests.machines import overrides_with_joints

@@ -12,7 +12,7 @@ import jsonschema
 import pytest
 
 from companion.cli.schema import KINDS, schema_json
-from companion.config.loader import PRESETS
+from companion.config.controller import PRESETS
 from companion.config.shipped import names
 from companion.config.yaml_strict import read_document
 from companion.sitl_config.loader import WORLDS

@@ -44,10 +44,7 @@ BAD = [
     ("a: 1\nb: {c: 1}\na: 2\n", ["f.yaml:3:1: a: duplicate key, already given on line 1; remove one of the two"]),
     ("a:\n\tb: 1\n", ["f.yaml:2:1: not YAML: a tab; indent with spaces"]),
     ("a: [1, 2\n", ["f.yaml:2:1: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"]),
-    (
-        "a: b: c\n",
-        ["f.yaml:1:5: not YAML: an unexpected ':'; check the line above, the quotes and the indentation"],
-    ),
+    ("a: b: c\n", ["f.yaml:1:5: not YAML: an unexpected ':'; check the line above, the quotes and the indentation"]),
     ("a: 1\nb\n", ["f.yaml:3:1: not YAML: a key without ':'"]),
     ("a: &x [1]\nb: *x\n", ["f.yaml:2:4: not YAML: aliases (*name) are not accepted; write the value out"]),
     (

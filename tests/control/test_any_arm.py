@@ -12,7 +12,8 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from companion.config.controller import AdaptiveConfig, CscConfig, LawConfig, PscConfig, fitted
+from companion.config.controller import AdaptiveConfig, CscConfig, LawConfig, PscConfig
+from companion.config.gains import fitted
 from companion.config.loader import load_flight
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import dynamics_of, manipulator_of

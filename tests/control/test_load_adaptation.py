@@ -19,7 +19,8 @@ from companion.control.arm_model import manipulator_of
 from companion.control.load_adaptation import LoadAdaptation
 from companion.mission.reference import at_rest
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import ControlLog, Joints, Matrix
+from companion.model.outputs import ControlLog
+from companion.model.types import Joints, Matrix
 from tests.control.states import POSE, ZERO, at
 
 CONFIG = load_flight("configs/missions/catch.yaml", preset="recommended")

@@ -17,7 +17,8 @@ from companion.control.adaptive import AdaptiveController
 from companion.control.online import TANK_MAX_J, OnlineImpedance
 from companion.control.types import Tuning
 from companion.core.flight_core import FlightCore
-from companion.model.types import Chi, Inputs, OperatorCommand, Outputs, PhaseKind, SafetyAction, Vec3
+from companion.model.outputs import Outputs
+from companion.model.types import Chi, Inputs, OperatorCommand, PhaseKind, SafetyAction, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight, FastResult

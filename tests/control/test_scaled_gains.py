@@ -11,8 +11,9 @@ import pytest
 from msgspec.structs import replace
 
 from companion.config.arm_chain import chain_of
-from companion.config.controller import LAWS, AdaptiveConfig, LawConfig, fitted
-from companion.config.loader import PRESETS, load_flight, load_vehicle
+from companion.config.controller import LAWS, PRESETS, AdaptiveConfig, LawConfig
+from companion.config.gains import fitted
+from companion.config.loader import load_flight, load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.arm_hold import DAMPING_NMS_RAD, STIFFNESS_NM_RAD, ArmHold
 from companion.control.arm_model import dynamics_of

@@ -11,6 +11,7 @@ import pytest
 
 from companion.core.flight_core import FlightCore
 from companion.model.flight_stage import PILOT_MODES
+from companion.model.outputs import Outputs
 from companion.model.types import (
     AutopilotRequest,
     FlightMode,
@@ -19,7 +20,6 @@ from companion.model.types import (
     MocapPose,
     OperatorCommand,
     Outcome,
-    Outputs,
     SafetyAction,
     Severity,
     VehicleState,

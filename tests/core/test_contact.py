@@ -21,7 +21,9 @@ from companion.core.flight_core import FlightCore
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import replay
 from companion.mission.check import check_mission
-from companion.model.types import ContactMode, Inputs, OperatorCommand, Outcome, Outputs
+from companion.model.contact import ContactMode
+from companion.model.outputs import Outputs
+from companion.model.types import Inputs, OperatorCommand, Outcome
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight, FastResult

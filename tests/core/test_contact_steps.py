@@ -13,8 +13,9 @@ from companion.core.flight_state import FlightState, Request
 from companion.core.transition import Parameters
 from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.plan import Plan
+from companion.model.contact import ContactMode, ContactState, TouchedPoint
 from companion.model.flight_stage import Stage
-from companion.model.types import ContactMode, ContactState, Inputs, Outcome, TouchedPoint, Vec3
+from companion.model.types import Inputs, Outcome, Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact.base import opening_of
 from tests.core.test_reactions import ids, tick

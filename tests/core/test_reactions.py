@@ -19,6 +19,7 @@ from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
 from companion.mission.reference import at_rest
 from companion.model.flight_stage import Stage
+from companion.model.outputs import TetherState
 from companion.model.types import (
     AutopilotRequest,
     Event,
@@ -28,7 +29,6 @@ from companion.model.types import (
     PhaseKind,
     SafetyAction,
     Severity,
-    TetherState,
     Vec3,
 )
 from companion.phases.contact import force

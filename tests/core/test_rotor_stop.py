@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from companion.core.flight_core import FlightCore
 from companion.flight.heartbeat import Heartbeats
+from companion.model.outputs import Outputs
 from companion.model.types import (
     AutopilotRequest,
     FlightMode,
@@ -19,7 +20,6 @@ from companion.model.types import (
     LinkIdentity,
     OperatorCommand,
     Outcome,
-    Outputs,
 )
 from tests.core.walk import (
     ON_ITS_BACK,

@@ -11,7 +11,8 @@ import pytest
 from companion.core.flight_core import FlightCore
 from companion.model import flight_stage as seq
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
-from companion.model.types import AutopilotRequest, FlightMode, Inputs, Outcome, Outputs
+from companion.model.outputs import Outputs
+from companion.model.types import AutopilotRequest, FlightMode, Inputs, Outcome
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from tests.safety.healthy import put

@@ -14,9 +14,10 @@ from companion.core.flight_state import FlightState, Request
 from companion.core.transition import Parameters
 from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.plan import Plan
+from companion.model.contact import ContactMode, ContactState
 from companion.model.flight_stage import Stage
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.types import ContactMode, ContactState, Inputs, Vec3
+from companion.model.types import Inputs, Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact import sliding
 from companion.phases.contact.slide import Slide

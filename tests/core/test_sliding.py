@@ -18,8 +18,10 @@ from companion.control.arm_model import manipulator_of
 from companion.core.flight_core import FlightCore
 from companion.mission.check import check_mission
 from companion.mission.reference import at_rest
+from companion.model.contact import ContactMode
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import ContactMode, Joints, Outcome, Outputs, Vec3
+from companion.model.outputs import Outputs
+from companion.model.types import Joints, Outcome, Vec3
 from companion.phases.contact.force import touches
 from companion.phases.contact.sliding import STEER_MAX_RAD, UNSEEN_MAX_N
 from companion.sitl_config.loader import load_sitl

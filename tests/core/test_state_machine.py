@@ -17,7 +17,8 @@ from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.air import Observation
 from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
-from companion.model.types import Event, Outcome, Outputs
+from companion.model.outputs import Outputs
+from companion.model.types import Event, Outcome
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.support import SHORT_CATCH

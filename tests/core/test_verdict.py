@@ -16,14 +16,8 @@ from companion.core.transition import Parameters
 from companion.core.verdict import sentence_of, verdict_of
 from companion.model.codec import differences
 from companion.model.flight_stage import Stage
-from companion.model.types import (
-    FlightMode,
-    Inputs,
-    OperatorCommand,
-    Outcome,
-    Outputs,
-    SafetyAction,
-)
+from companion.model.outputs import Outputs
+from companion.model.types import FlightMode, Inputs, OperatorCommand, Outcome, SafetyAction
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.flights.test_ladder_flights import TAUT

@@ -15,6 +15,7 @@ import msgspec
 
 from companion.core.flight_core import FlightCore
 from companion.model.frames import quat_from_euler_zyx
+from companion.model.outputs import Outputs
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
@@ -22,7 +23,6 @@ from companion.model.types import (
     Inputs,
     LandedState,
     MocapPose,
-    Outputs,
     Quat,
     VehicleState,
 )

@@ -14,8 +14,8 @@ import pytest
 from companion.analysis.summary import empty_summary
 from companion.cli.main import _normalised, make_parser
 from companion.config.base import Model
-from companion.config.controller import AdaptiveConfig
-from companion.config.loader import PRESETS, load_flight
+from companion.config.controller import PRESETS, AdaptiveConfig
+from companion.config.loader import load_flight
 from companion.config.safety import Safety
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_CODES
 from companion.model.types import SafetyAction

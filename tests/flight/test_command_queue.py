@@ -11,7 +11,8 @@ import pytest
 
 from companion.flight.command_queue import WAITING_MAX, Operator, StartCancelled, TickCommand
 from companion.model.launcher_messages import Land
-from companion.model.types import AutopilotRequest, GroundCommand, OperatorCommand, Outputs, PhaseKind, SafetyAction
+from companion.model.outputs import Outputs
+from companion.model.types import AutopilotRequest, GroundCommand, OperatorCommand, PhaseKind, SafetyAction
 from companion.runtime import ipc
 from tests.support import DEADLINE_S
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from companion.model.types import Outputs
+from companion.model.outputs import Outputs
 
 
 def after(event_id: str, seconds: float = 0.0) -> Callable[[Outputs], bool]:

@@ -105,11 +105,7 @@ def test_without_force_sensor_the_mission_goes_on() -> None:
     assert "force_lost" in event_ids(result)
 
 
-@pytest.mark.parametrize(
-    "axes",
-    [(1, 2, -3), (3, 2, 1)],
-    ids=lambda axes: "".join(map("{:+}".format, axes)),
-)
+@pytest.mark.parametrize("axes", [(1, 2, -3), (3, 2, 1)], ids=lambda axes: "".join(map("{:+}".format, axes)))
 def test_a_force_sensor_with_wrong_axes_is_reported_at_the_catch_and_not_used(axes: tuple[int, ...]) -> None:
     """The signs of its axes, or their order. The arm is unfolded: the payload's weight has a part along x and one along z."""
     flight = FastFlight(configured())

@@ -72,7 +72,7 @@ def page_at(address: str) -> Iterator[Page]:
     complaints: list[str] = []
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium(), args=list(ARGUMENTS))
-        page = browser.new_page(viewport={"width": 1440, "height": 900})
+        page = browser.new_page(viewport={"width": 480, "height": 480}, reduced_motion="reduce")
         page.set_default_timeout(DEADLINE_S * 1e3)
         page.on("pageerror", lambda error: complaints.append(str(error)))
         page.goto(address)

@@ -14,7 +14,8 @@ from companion.core.flight_core import FlightCore
 from companion.flight import control_loop
 from companion.flight import main as app
 from companion.launcher.launcher import replace_device_settings
-from companion.model.types import Inputs, Outcome, Outputs
+from companion.model.outputs import Outputs
+from companion.model.types import Inputs, Outcome
 from tests.support import DEADLINE_S, HOVER, LOW_HOVER, PATIENT, World, sandbox_in, set_options
 
 BREAKS_AFTER_S = 2.5

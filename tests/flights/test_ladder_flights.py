@@ -13,13 +13,13 @@ import pytest
 from companion.core.flight_core import FlightCore
 from companion.model.codec import differences
 from companion.model.frames import tilt_rad
+from companion.model.outputs import Outputs
 from companion.model.types import (
     AutopilotRequest,
     FlightMode,
     Inputs,
     OperatorCommand,
     Outcome,
-    Outputs,
     SafetyAction,
     VehicleState,
 )

@@ -20,7 +20,7 @@ from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
 from companion.model.types import Inputs
 from companion.sitl_config.loader import SitlConfig
 from sitl.fast.loop import FastFlight
-from tests.support import HOVER, SHORT_CATCH, Ended, Sandbox, read_summary, run_here, sandbox_in, set_options
+from tests.support import HOVER, SHORT_CATCH, Ended, Sandbox, read_summary, run_here, sandbox_in
 
 FLOAT32 = 1e-6
 """Rounding of positions, attitudes and forces on the wires, with what the flight makes of it within some seconds."""
@@ -88,8 +88,11 @@ def test_it_leaves_a_summary_a_report_and_a_log_that_replays(flown: Flown) -> No
 
 def test_beside_busy_programs_it_repeats_itself_bit_for_bit(flown: Flown, tmp_path: Path) -> None:
     log = flown.log
-    with busy_programs(len(os.sched_getaffinity(0))), sandbox_in(tmp_path / "again") as sandbox:
-        ended = sandbox.run(*IN_LAB, "--speed", "3")
+    with sandbox_in(tmp_path / "again") as sandbox, sandbox.start(*IN_LAB, "--speed", "3") as running:
+        running.wait_for("  take-off\n")
+        with busy_programs(len(os.sched_getaffinity(0))):
+            running.wait_for("  land\n")
+        ended = running.end()
         assert ended.code == EXIT_OK, ended
         again = FlightLog.read(sandbox.cwd / "out/flight.mcap")
     assert len(again.inputs) == len(log.inputs)
@@ -151,16 +154,22 @@ def test_it_is_the_flight_of_the_fast_loop(flown: Flown) -> None:
     assert abs(len(fast.outputs) - len(log.outputs)) <= 3
 
 
-def test_a_flight_process_that_somebody_stops_is_landed_by_the_guardian(sandbox: Sandbox) -> None:
-    """The world waits for it, then lets time go on, and the guardian finds it silent."""
-    with sandbox.start("fly", HOVER, "--sitl", "--out", "out") as running:
-        running.wait_for("  take-off\n")
+def test_slower_than_real_time_px4_is_not_lost_and_a_flight_process_that_somebody_stops_is_landed_by_the_guardian(
+    sandbox: Sandbox,
+) -> None:
+    """MAVSDK lives on the computer's clock, and hears a heartbeat every 3.3 s. The world waits for a stopped process, then lets
+    time go on, and the guardian finds it silent.
+    """
+    with sandbox.start("fly", HOVER, "--sitl", "--out", "out", "--speed", "0.3") as running:
+        running.wait_for("  hold\n")
         os.kill(sandbox.pid_of("companion.flight.main"), signal.SIGSTOP)
         ended = running.end()
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_ABORTED, ended.err
     assert "hung and was killed; the guardian landed the vehicle" in ended.err
-    assert read_summary(sandbox.cwd / "out")["outcome"] == "aborted"
+    summary = read_summary(sandbox.cwd / "out")
+    ids = [event["id"] for event in summary["events"]]
+    assert summary["outcome"] == "aborted" and ids[:2] == ["takeoff", "guardian_took_over"], ids
 
 
 @pytest.mark.parametrize(
@@ -179,11 +188,3 @@ def test_a_speed_that_cannot_be_flown_is_refused_in_one_line(words: tuple[str, .
     assert ended.code == EXIT_BAD_INPUT
     assert ended.out == ""
     assert len(ended.err_lines) == 1 and line in ended.err
-
-
-def test_slower_than_real_time_px4_is_not_lost(sandbox: Sandbox) -> None:
-    """MAVSDK lives on the computer's clock, and hears a heartbeat every 3.3 s: nothing is lost until a pilot ends the take-off."""
-    kill = set_options(**{"world.faults": [{"kind": "kill_switch", "t_s": 2.3}]})
-    ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", "--speed", "0.3", *kill)
-    assert (ended.code, ended.err) == (EXIT_ABORTED, "")
-    assert [event["id"] for event in read_summary(sandbox.cwd / "out")["events"]] == ["takeoff", "killed"]

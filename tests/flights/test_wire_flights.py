@@ -14,18 +14,8 @@ from companion.analysis.contact import rotor_distance_m
 from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_ABORTED
 from companion.model.frames import euler_zyx_from_quat
-from tests.support import (
-    HOVER,
-    HOVERS_S,
-    Sandbox,
-    World,
-    bridged,
-    plugged,
-    read_summary,
-    sandbox_in,
-    serial_line,
-    set_options,
-)
+from tests.support import HOVER, HOVERS_S, Sandbox, World, read_summary, sandbox_in, set_options
+from tests.wires import bridged, plugged, serial_line
 
 LANDS_S = 0.5
 """From the lost arm to the lost poses: the landing is under way, and above the floor."""

@@ -13,10 +13,7 @@ from companion.config.yaml_strict import parse_value, read_document
 
 @pytest.mark.parametrize(
     ("text", "place"),
-    [
-        ('a: 1\nb: "\\uD800"\n', "f.yaml:2:4: b: an escape"),
-        ('a: 1\n"\\uDFFF": 2\n', "f.yaml:2:1: an escape"),
-    ],
+    [('a: 1\nb: "\\uD800"\n', "f.yaml:2:4: b: an escape"), ('a: 1\n"\\uDFFF": 2\n', "f.yaml:2:1: an escape")],
 )
 def test_half_a_character_is_refused_where_it_stands(tmp_path: Path, text: str, place: str) -> None:
     path = tmp_path / "f.yaml"

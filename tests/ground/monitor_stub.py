@@ -35,7 +35,8 @@ from companion.ground.station.web_guard import HEADERS
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import replay
 from companion.model.codec import to_jsonable
-from companion.model.types import OperatorCommand, Sent
+from companion.model.outputs import Sent
+from companion.model.types import OperatorCommand
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.ground.vehicle import ack_of, state_of

@@ -20,15 +20,7 @@ from rich.console import Console
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.commands import Accepted, Verifier, make_command
 from companion.ground.protocol.connection import Connection
-from companion.ground.protocol.messages import (
-    VERSION,
-    Preflight,
-    PreflightRow,
-    Presence,
-    Stream,
-    Topic,
-    encode,
-)
+from companion.ground.protocol.messages import VERSION, Preflight, PreflightRow, Presence, Stream, Topic, encode
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.station.hub import Hub, Outbox
 from companion.ground.station.station import Station

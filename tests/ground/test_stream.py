@@ -27,15 +27,13 @@ from companion.ground.telemetry.stream import TEXT_MAX, StreamBuilder, replay
 from companion.model.codec import Record
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.markers import BallState
+from companion.model.outputs import ActiveRule, Outputs, Sent
 from companion.model.types import (
-    ActiveRule,
     AttitudeSetpoint,
     Event,
     Inputs,
-    Outputs,
     PhaseKind,
     SafetyAction,
-    Sent,
     Severity,
     VehicleState,
 )

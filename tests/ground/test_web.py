@@ -20,16 +20,7 @@ from companion.ground.station.station import Station
 from companion.ground.station.web import Monitor, ServerSettings
 from companion.ground.station.web_guard import HEADERS, MESSAGE_MAX_BYTES
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import (
-    OPERATORS,
-    SIGNER,
-    base_of,
-    monitor_at,
-    on_page,
-    self_signed,
-    until,
-    viewer_of,
-)
+from tests.ground.monitor_rig import OPERATORS, SIGNER, base_of, monitor_at, on_page, self_signed, until, viewer_of
 from tests.ground.vehicle import flight, played_vehicle
 
 

@@ -15,11 +15,11 @@ from companion.flight.heartbeat import Heartbeats, HeartbeatSender
 from companion.guardian import heartbeat
 from companion.guardian.client import SILENT_S, GuardianClient
 from companion.io.protocols import DeviceError
+from companion.model.contact import ContactMode, ContactState
+from companion.model.outputs import Outputs
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
-    ContactMode,
-    ContactState,
     Event,
     FlightMode,
     Inputs,
@@ -27,7 +27,6 @@ from companion.model.types import (
     LinkIdentity,
     MocapPose,
     OperatorCommand,
-    Outputs,
     PhaseKind,
     SafetyAction,
     Severity,

@@ -18,7 +18,8 @@ from companion.io.mocap.system import MocapSettings
 from companion.model.types import MocapPose
 from sitl.natnet import BodyPose, encode_frame
 from tests.guardian.rig import ARMED, ATTITUDE, DISARMED, LAND_MODE, OFFBOARD_MODE, Cameras, Rig
-from tests.support import DEADLINE_S, plugged, serial_line, wait_until
+from tests.support import DEADLINE_S, wait_until
+from tests.wires import plugged, serial_line
 
 NAV_LAND = mavlink.MAV_CMD_NAV_LAND
 

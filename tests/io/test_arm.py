@@ -30,7 +30,8 @@ from companion.runtime.clock import flight_clock
 from sitl.servo.bus import ServoBus
 from sitl.servo.kinds import KINDS
 from sitl.servo.model import ServoModel
-from tests.support import DEADLINE_S, plugged
+from tests.support import DEADLINE_S
+from tests.wires import plugged
 
 KT = 1.3
 NM_PER_COUNT = KT * 2.69e-3

@@ -78,22 +78,13 @@ def tripped() -> list[ServoModel]:
 @pytest.mark.parametrize(
     ("servos", "found"),
     [
-        (
-            lambda: new_servos()[:1],
-            "servo 12 (joint 2): does not answer at 3000000 baud; ids that answer: 11;",
-        ),
-        (
-            lambda: new_servos(57600),
-            "servo 11 (joint 1): does not answer at 3000000 baud; no servo answers at all;",
-        ),
+        (lambda: new_servos()[:1], "servo 12 (joint 2): does not answer at 3000000 baud; ids that answer: 11;"),
+        (lambda: new_servos(57600), "servo 11 (joint 1): does not answer at 3000000 baud; no servo answers at all;"),
         (
             lambda: [ServoModel(11, model=1020), ServoModel(12)],
             "servo 11 (joint 1): is XM430-W350 (model 1020); the vehicle file says XM430-W210",
         ),
-        (
-            tripped,
-            "servo 12 (joint 2): reports a hardware error: overload (hardware error status (register 70) = 32)",
-        ),
+        (tripped, "servo 12 (joint 2): reports a hardware error: overload (hardware error status (register 70) = 32)"),
         (
             lambda: new_servos(start_deg=(165.0, 170.0)),
             "servo 12 (joint 2): is at 170.0 deg (present position (register 132) = 2958), outside its limits -150 to 150 deg",

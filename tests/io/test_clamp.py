@@ -37,7 +37,7 @@ class Clamp:
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.002)):
             self.t_s += 0.002
-            self.world.step(self.t_s)
+            self.world.step(self.t_s, handle_near=False)
 
     @property
     def angle_deg(self) -> float:

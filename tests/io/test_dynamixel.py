@@ -11,11 +11,7 @@ from hypothesis import strategies as st
 
 from companion.config.arm import Joint
 from companion.io.dynamixel import registers as dxl
-from companion.io.dynamixel.registers import (
-    joint_scale,
-    turn_offset_counts,
-    usb_latency_ms,
-)
+from companion.io.dynamixel.registers import joint_scale, turn_offset_counts, usb_latency_ms
 from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
 
 KT = 1.3

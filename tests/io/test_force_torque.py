@@ -20,7 +20,8 @@ from companion.io.protocols import DeviceError, ForceTorque
 from companion.model.types import ForceSample
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
-from tests.support import DEADLINE_S, plugged, serial_line
+from tests.support import DEADLINE_S
+from tests.wires import plugged, serial_line
 
 # 0x55AA and -0x55AB in counts: SOP and EOP in the payload, both ways round.
 AWKWARD = Wrench(
@@ -188,12 +189,7 @@ async def test_start_and_stop_bytes_in_the_payload_and_noise_between_packets() -
     async with ForceTorqueServer() as server, world(server):
         server.set_wrench(AWKWARD.force_n, AWKWARD.torque_nm)
         async with driver(server.port) as edge:
-            for noise in (
-                b"\x55\xaa\x55",
-                b"\x00" * 7,
-                rft.encode_wrench(Command.START, AWKWARD)[:9],
-                b"\x55" * 30,
-            ):
+            for noise in (b"\x55\xaa\x55", b"\x00" * 7, rft.encode_wrench(Command.START, AWKWARD)[:9], b"\x55" * 30):
                 server.inject(noise)
                 for sample in await edge.tare_samples(0.05):
                     assert sample.force_sensor_n == AWKWARD.force_n

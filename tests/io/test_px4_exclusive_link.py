@@ -25,7 +25,8 @@ from companion.model.types import MocapPose
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
 from tests.io.test_px4 import edge, refused
-from tests.support import DEADLINE_S, eventually, free_udp_port, serial_line
+from tests.support import DEADLINE_S, eventually, free_udp_port
+from tests.wires import serial_line
 
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 ARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED

@@ -17,14 +17,12 @@ from companion.io.protocols import DeviceError
 from companion.io.px4 import params as autopilot_params
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.estimator import EstimatorReport
-from companion.model.types import (
-    AttitudeSetpoint,
-    AutopilotRequest,
-)
+from companion.model.types import AttitudeSetpoint, AutopilotRequest
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import PARAMS, Px4Peer
 from tests.io.test_px4 import ARM_DISARM, armed, edge, linked, refused
-from tests.support import DEADLINE_S, eventually, free_udp_port, serial_line
+from tests.support import DEADLINE_S, eventually, free_udp_port
+from tests.wires import serial_line
 
 
 async def test_parameters_and_firmware_are_read_from_the_wire_and_parameters_written() -> None:

@@ -17,7 +17,8 @@ from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.types import AttitudeSetpoint, AutopilotRequest
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import PARAMS, Px4Peer
-from tests.support import DEADLINE_S, bridged, eventually, plugged, serial_line
+from tests.support import DEADLINE_S, eventually
+from tests.wires import bridged, plugged, serial_line
 
 LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.5)
 PIECE_BYTES = 17

@@ -15,7 +15,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.link import Link
 from companion.io.px4.wire import ROUND_DATAGRAMS, SerialWire, TcpWire, UdpWire, Wire, open_wire
-from tests.support import DEADLINE_S, free_udp_port, serial_line, wait_until
+from tests.support import DEADLINE_S, free_udp_port, wait_until
+from tests.wires import serial_line
 
 
 def heartbeat(system: int = 1, component: int = 1) -> bytes:

@@ -28,6 +28,7 @@ from companion.io.qgroundcontrol.channel import pack, unpack
 from companion.io.qgroundcontrol.relay import GONE
 from companion.io.qgroundcontrol.station import GroundStation, check_address
 from companion.io.qgroundcontrol.uplink_filter import UP_BURST, UP_RATE_HZ
+from companion.model.outputs import Outputs, TetherState
 from companion.model.types import (
     AttitudeSetpoint,
     AutopilotRequest,
@@ -36,11 +37,9 @@ from companion.model.types import (
     Inputs,
     LinkIdentity,
     OperatorCommand,
-    Outputs,
     PhaseKind,
     SafetyAction,
     Severity,
-    TetherState,
 )
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import POSITION_NED_M, Px4Peer

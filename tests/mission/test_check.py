@@ -17,7 +17,7 @@ from companion.mission.plan import Plan
 from companion.safety.flight import FlightTracker
 from companion.safety.rule import thresholds_of
 from companion.safety.rules import RULES
-from companion.safety.tether import TetherWatch, allowed_m, attachment_world_m, distance_m, slack_m
+from companion.safety.tether import TetherWatch, attachment_world_m, distance_m, slack_m
 from tests.safety.healthy import flying, healthy
 from tests.support import tether_of
 
@@ -260,4 +260,3 @@ def test_tether_geometry() -> None:
     assert attachment_world_m(tether, (1.0, 0.0, 0.8), left) == pytest.approx((1.0, 0.1, 1.0))
     assert distance_m(tether, (1.0, 0.0, 0.8), left) == pytest.approx((1.0 + 0.01 + 1.0) ** 0.5)
     assert slack_m(tether, (1.0, 0.0, 0.8), left) == pytest.approx(tether.length_m - 2.01**0.5)
-    assert allowed_m(tether) == pytest.approx(tether.length_m - tether.margin_m)

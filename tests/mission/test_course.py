@@ -46,9 +46,7 @@ def assert_rates_are_derivatives(samples: list[Reference]) -> None:
 
 @settings(max_examples=40)
 @given(
-    st.sampled_from(["catch", "circuit"]),
-    st.floats(0.0, 17.0),
-    st.lists(st.floats(0.05, 4.0), min_size=1, max_size=6),
+    st.sampled_from(["catch", "circuit"]), st.floats(0.0, 17.0), st.lists(st.floats(0.05, 4.0), min_size=1, max_size=6)
 )
 def test_any_holds_and_resumptions_are_smooth_and_on_the_planned_way(
     name: str, first_s: float, pauses_s: list[float]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from companion.model import packets, types
+from companion.model import outputs, packets, types
 from companion.model.codec import (
     Record,
     RecordError,
@@ -26,9 +26,10 @@ from companion.model.codec import (
     to_jsonable,
     to_packet,
 )
+from companion.model.contact import ContactState
 from companion.phases.contact.force import begun
 
-RECORDS = [types.Inputs, types.Outputs, types.Sent, types.GroundCommand]
+RECORDS = [types.Inputs, outputs.Outputs, outputs.Sent, types.GroundCommand]
 """With the records in them."""
 
 st.register_type_strategy(float, st.floats())
@@ -62,7 +63,7 @@ def test_a_field_that_is_left_out_because_it_has_its_default_is_not_required() -
     contact = begun(1.0, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     document = json.loads(to_json(contact))
     assert set(document) < set(contact.__struct_fields__)
-    jsonschema.Draft202012Validator(json_schema(types.ContactState)).validate(document)
+    jsonschema.Draft202012Validator(json_schema(ContactState)).validate(document)
 
 
 def float_sum(value: Any) -> float:
@@ -147,7 +148,7 @@ def test_damaged_packets_are_refused(data: bytes) -> None:
 
 
 def test_the_schema_names_units_and_requires_what_cannot_be_none() -> None:
-    schema = json_schema(types.Outputs)
+    schema = json_schema(outputs.Outputs)
     assert schema["title"] == "companion.Outputs"
     assert schema["properties"]["reference"]["properties"]["position_world_m"] == {
         "type": "array",
@@ -161,7 +162,7 @@ def test_the_schema_names_units_and_requires_what_cannot_be_none() -> None:
 
 def test_the_fingerprint_of_a_tick_is_that_of_the_logs_there_are() -> None:
     """Whoever changes a field of these records changes it here, knowing that no log written before can be replayed."""
-    assert fingerprint(types.Inputs, types.Outputs, types.Sent) == "a32d71713027919f"
+    assert fingerprint(types.Inputs, outputs.Outputs, outputs.Sent) == "a32d71713027919f"
 
 
 @pytest.mark.parametrize("cls", [*RECORDS, *(hint for hint in packets.Packet.__args__)])

@@ -21,8 +21,7 @@ def same(a: tuple[float, ...], b: tuple[float, ...], tol: float = 1e-12) -> bool
 
 
 @pytest.mark.parametrize(
-    ("enu", "ned"),
-    [((1, 0, 0), (0, 1, 0)), ((0, 1, 0), (1, 0, 0)), ((0, 0, 1), (0, 0, -1)), ((1, 2, 3), (2, 1, -3))],
+    ("enu", "ned"), [((1, 0, 0), (0, 1, 0)), ((0, 1, 0), (1, 0, 0)), ((0, 0, 1), (0, 0, -1)), ((1, 2, 3), (2, 1, -3))]
 )
 def test_world_vectors(enu: Vec3, ned: Vec3) -> None:
     assert frames.ned_from_enu(enu) == ned

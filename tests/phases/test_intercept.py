@@ -22,17 +22,10 @@ from companion.model.markers import Marker, MarkerFrame
 from companion.model.types import Inputs, OperatorCommand, Reference, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate
-from companion.phases.intercept.meeting import (
-    BODY_S2,
-    RISES_S,
-    TILT_S2_M,
-    Bounds,
-    Lag,
-    State,
-    meetings,
-    reach_of,
-)
-from companion.phases.intercept.phase import Intercept, Interception, Mode, net_m, opening
+from companion.phases.intercept.meeting import BODY_S2, RISES_S, TILT_S2_M, Lag, meetings, reach_of
+from companion.phases.intercept.motion import Bounds, State
+from companion.phases.intercept.net import net_m, opening
+from companion.phases.intercept.phase import Intercept, Interception, Mode
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 from companion.safety.stop import StopModel

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import socket
-import struct
 import threading
 import time
 import tomllib
@@ -43,75 +41,13 @@ from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from sitl.wires import MachineWires, Ports
 from sitl.world.start import start_of
+from tests.plugins.arms import NAMES, SCRIPTED, ODrives
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import ROOT, SHORT_CATCH
 
 EXAMPLE = ROOT / "examples/arm_odrive"
 VEHICLE = (ROOT / "configs/vehicles/tarot650_2r.yaml").read_text(encoding="utf-8")
 LONG_S = 30.0
-SCRIPTED = '''
-import math, time
-from companion.config.base import Model
-from companion.io.arm.motors import MotorState
-
-class Options(Model):
-    """For tests."""
-    after: int = 10**9
-    angles: list[float] = [0.5, -0.25]
-
-class Steady:
-    options, product_name, watchdog, watchdog_ms = Options, "Steady 1.0", "a relay", 100
-    made = []
-    def __init__(self, options, device, joints):
-        self.left, self.angles, self.calls, self.written = options.after, options.angles, [], []
-        Steady.made.append(self)
-    def open(self): self.calls.append("open")
-    def read(self):
-        self.left -= 1
-        return self.later() if self.left < 0 else self.states()
-    def states(self): return [MotorState(angle, 2.0, 0.75, 40.0) for angle in self.angles]
-    later = states
-    def write_torque(self, torque_nm): self.written.append(tuple(torque_nm))
-    def torque_off(self): self.calls.append("torque_off")
-    def close(self): self.calls.append("close")
-class Raising(Steady):
-    def later(self): raise OSError("bus off\\nsince today")
-class Unwritable(Steady):
-    def write_torque(self, torque_nm):
-        self.left -= 1
-        if self.left < 0: raise OSError("buffer full")
-class Nan(Steady):
-    def later(self): return [MotorState(0.5, math.nan, 0.0), MotorState(0.0, 0.0, 0.0)]
-class Short(Steady):
-    def later(self): return self.states()[:1]
-class Wrong(Steady):
-    def later(self): return (0.5, -0.25)
-class Slow(Steady):
-    def read(self):
-        time.sleep(0.006)
-        return self.states()
-class Faulty(Steady):
-    def later(self): return [MotorState(0.5, 0.0, 0.0, None, "over\\ncurrent"), MotorState(-0.25, 0.0, 0.0)]
-class Unwatched(Steady):
-    watchdog = " "
-class Patient(Steady):
-    watchdog_ms = 101.0
-class Timeless(Steady):
-    watchdog_ms = math.nan
-class Absent(Steady):
-    def open(self): raise ConnectionError("no motor\\nanswers")
-class Unmade(Steady):
-    def __init__(self, options): pass
-class NoOff:
-    options, product_name, watchdog = Options, "Half 1.0", "none"
-    open = read = write_torque = close = lambda self: None
-class NoOptions(Steady):
-    options = None
-class Stays(Steady):
-    def close(self): time.sleep(3.0)
-'''
-NAMES = ("Steady", "Raising", "Unwritable", "Nan", "Short", "Wrong", "Slow", "Faulty", "Unwatched", "Patient", "Timeless", "Absent",
-         "Unmade", "NoOff", "NoOptions", "Stays")  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
@@ -149,52 +85,6 @@ def made() -> Any:
     import lab_arm  # type: ignore[import-not-found]
 
     return lab_arm.Steady.made[-1]
-
-
-class ODrives:
-    """ODrives with some node ids at the other end of a CAN interface; each shaft follows its torque without inertia."""
-
-    def __init__(self, *nodes: int) -> None:
-        self.torques_nm = dict.fromkeys(nodes, 0.0)
-        self.states = dict.fromkeys(nodes, 1)
-        self.errors = dict.fromkeys(nodes, 0)
-        self.silent = False
-        self.ours, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> ODrives:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.ours.close()
-        self._theirs.shutdown(socket.SHUT_RDWR)
-        self._thread.join()
-        self._theirs.close()
-
-    def _run(self) -> None:
-        frame = struct.Struct("<IB3x8s")
-        while received := self._theirs.recv(64):
-            identity, size, data = frame.unpack(received)
-            node, command = (identity & 0x7FF) >> 5, identity & 0x1F
-            if node not in self.torques_nm or self.silent:
-                continue
-            if not identity & 0x40000000:
-                if command == 0x0E:
-                    assert size == 4
-                    self.torques_nm[node] = struct.unpack("<f", data[:4])[0]
-                if command == 0x07:
-                    self.states[node] = struct.unpack("<I", data[:4])[0]
-                continue
-            answer = {
-                0x00: bytes((2, 4, 4, 58, 0, 6, 10, 0)),
-                0x01: struct.pack("<IB3x", 0, self.states[node]),
-                0x03: struct.pack("<II", self.errors[node], 0),
-                0x09: struct.pack("<ff", 0.25 * node, 0.5),
-                0x15: struct.pack("<ff", 35.0, 42.0),
-                0x1C: struct.pack("<ff", 0.0, self.torques_nm[node]),
-            }[command]
-            self._theirs.send(frame.pack(identity & 0x7FF, 8, answer))
 
 
 @contextmanager
@@ -385,68 +275,53 @@ def test_angles_rates_and_torques_are_those_of_the_joints() -> None:
     assert made().calls == ["open", "torque_off", "close"] and made().written[-1] == (0.0, 0.0)
 
 
-def test_a_torque_that_is_not_renewed_is_withdrawn() -> None:
-    async def run() -> None:
-        async with PluginArm(device("steady"), ARM, flight_clock()) as arm:
-            arm.write_torque((1.0, 1.0))
-            await state_when(arm, lambda state: (1.0, -1.0) in made().written)
-            await state_when(arm, lambda state: made().written[-1] == (0.0, 0.0))
-
-    asyncio.run(run())
+async def test_a_torque_that_is_not_renewed_is_withdrawn() -> None:
+    async with PluginArm(device("steady"), ARM, flight_clock()) as arm:
+        arm.write_torque((1.0, 1.0))
+        await state_when(arm, lambda state: (1.0, -1.0) in made().written)
+        await state_when(arm, lambda state: made().written[-1] == (0.0, 0.0))
 
 
-def test_whole_turns_of_a_motor_do_not_matter() -> None:
-    async def run() -> None:
-        turned = [0.5 + 6.0 * math.pi, -0.25 - 2.0 * math.pi]
-        async with PluginArm(device("steady", angles=turned), ARM, flight_clock()) as arm:
-            state = arm.latest()
-            assert state is not None and state.angle_rad == pytest.approx((0.5, 0.5 * math.pi + 0.25))
-
-    asyncio.run(run())
+async def test_whole_turns_of_a_motor_do_not_matter() -> None:
+    turned = [0.5 + 6.0 * math.pi, -0.25 - 2.0 * math.pi]
+    async with PluginArm(device("steady", angles=turned), ARM, flight_clock()) as arm:
+        state = arm.latest()
+        assert state is not None and state.angle_rad == pytest.approx((0.5, 0.5 * math.pi + 0.25))
 
 
 @pytest.mark.parametrize("name", ["raising", "nan", "short", "unwritable"])
-def test_an_arm_that_fails_in_the_air_counts_failed_cycles(name: str) -> None:
-    async def run() -> None:
-        async with PluginArm(device(name, after=60), ARM, flight_clock()) as arm:
-            async with asyncio.timeout(LONG_S):
-                while (state := await arm.read(1.0)) is None or state.read_failures < 5:
-                    arm.write_torque((0.0, 0.0))
-            assert arm.problem
-
-    asyncio.run(run())
+async def test_an_arm_that_fails_in_the_air_counts_failed_cycles(name: str) -> None:
+    async with PluginArm(device(name, after=60), ARM, flight_clock()) as arm:
+        async with asyncio.timeout(LONG_S):
+            while (state := await arm.read(1.0)) is None or state.read_failures < 5:
+                arm.write_torque((0.0, 0.0))
+        assert arm.problem
 
 
-def test_a_fault_of_a_motor_is_a_hardware_error() -> None:
-    async def run() -> None:
-        async with PluginArm(device("faulty", after=60), ARM, flight_clock()) as arm:
+async def test_a_fault_of_a_motor_is_a_hardware_error() -> None:
+    async with PluginArm(device("faulty", after=60), ARM, flight_clock()) as arm:
+        state = await state_when(arm, lambda state: any(state.hardware_error))
+        assert error_text(state.hardware_error) == "servo 1: fault of the motor"
+
+
+async def test_an_odrive_turns_into_a_joint(monkeypatch: pytest.MonkeyPatch) -> None:
+    with odrives(monkeypatch) as motors:
+        async with PluginArm(odrive(), ODRIVE_ARM, flight_clock()) as arm:
+            assert arm.statement == ArmStatement(
+                "ODrive, firmware 0.6.10 and 0.6.10",
+                "the ODrives' own watchdogs, as set with odrivetool (not read), after 100 ms",
+            )
+            state = arm.latest()
+            assert state is not None and motors.states == {3: 8, 5: 8}
+            assert state.angle_rad == pytest.approx((0.75 / 8 * 2 * math.pi, -1.25 / 8 * 2 * math.pi))
+            assert state.velocity_rad_s == pytest.approx((math.pi / 8, -math.pi / 8))
+            assert state.temperature_c == (42.0, 42.0)
+            # Renewed, because a torque is withdrawn after 0.1 s.
+            state = await state_when(arm, lambda state: arm.write_torque((4.0, 2.0)) and state.torque_nm[1] == 2.0)
+            assert state.torque_nm == (4.0, 2.0)
+            motors.errors[5] = 0x2000
             state = await state_when(arm, lambda state: any(state.hardware_error))
-            assert error_text(state.hardware_error) == "servo 1: fault of the motor"
-
-    asyncio.run(run())
-
-
-def test_an_odrive_turns_into_a_joint(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def run() -> None:
-        with odrives(monkeypatch) as motors:
-            async with PluginArm(odrive(), ODRIVE_ARM, flight_clock()) as arm:
-                assert arm.statement == ArmStatement(
-                    "ODrive, firmware 0.6.10 and 0.6.10",
-                    "the ODrives' own watchdogs, as set with odrivetool (not read), after 100 ms",
-                )
-                state = arm.latest()
-                assert state is not None and motors.states == {3: 8, 5: 8}
-                assert state.angle_rad == pytest.approx((0.75 / 8 * 2 * math.pi, -1.25 / 8 * 2 * math.pi))
-                assert state.velocity_rad_s == pytest.approx((math.pi / 8, -math.pi / 8))
-                assert state.temperature_c == (42.0, 42.0)
-                # Renewed, because a torque is withdrawn after 0.1 s.
-                state = await state_when(arm, lambda state: arm.write_torque((4.0, 2.0)) and state.torque_nm[1] == 2.0)
-                assert state.torque_nm == (4.0, 2.0)
-                motors.errors[5] = 0x2000
-                state = await state_when(arm, lambda state: any(state.hardware_error))
-                assert error_text(state.hardware_error) == "servo 2: fault of the motor"
-
-    asyncio.run(run())
+            assert error_text(state.hardware_error) == "servo 2: fault of the motor"
 
 
 def test_an_odrive_that_is_silent_or_has_a_slow_watchdog_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -533,12 +408,9 @@ def test_the_simulated_world_has_servos_with_the_torque_of_the_motors(tmp_path: 
     ]
 
 
-def test_an_arm_of_strong_motors_opens_in_the_simulated_world() -> None:
-    async def run() -> None:
-        async with servos_of(ODRIVE_ARM) as bus, open_arm(on_bus(bus), ODRIVE_ARM, flight_clock()) as arm:
-            assert arm.write_torque((20.0, -0.5)) == pytest.approx((20.0, -0.5), abs=0.02)
-
-    asyncio.run(run())
+async def test_an_arm_of_strong_motors_opens_in_the_simulated_world() -> None:
+    async with servos_of(ODRIVE_ARM) as bus, open_arm(on_bus(bus), ODRIVE_ARM, flight_clock()) as arm:
+        assert arm.write_torque((20.0, -0.5)) == pytest.approx((20.0, -0.5), abs=0.02)
 
 
 def test_a_vehicle_with_another_arm_completes_the_catch_in_the_fast_loop(tmp_path: Path) -> None:

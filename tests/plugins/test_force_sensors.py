@@ -295,59 +295,44 @@ def test_the_built_in_sensor_needs_a_port(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "lost"), [("raising", "read() raised OSError: unplugged"), ("silent", None), ("nan", None)]
 )
-def test_a_sensor_that_fails_in_the_air_leaves_its_last_sample(name: str, lost: str | None) -> None:
-    async def run() -> None:
-        async with open_force(sensor(name, after=8), flight_clock()) as driver:
-            with pytest.raises(DeviceError, match="none in the last 1 s"):
-                await driver.tare_samples(1.0)
-            assert driver.latest() is not None
-            assert driver.counts().samples == 8 and driver.counts().lost == lost
-
-    asyncio.run(run())
+async def test_a_sensor_that_fails_in_the_air_leaves_its_last_sample(name: str, lost: str | None) -> None:
+    async with open_force(sensor(name, after=8), flight_clock()) as driver:
+        with pytest.raises(DeviceError, match="none in the last 1 s"):
+            await driver.tare_samples(1.0)
+        assert driver.latest() is not None
+        assert driver.counts().samples == 8 and driver.counts().lost == lost
 
 
-def test_a_force_beyond_its_range_counts_as_an_overload() -> None:
-    async def run() -> None:
-        async with open_force(sensor("steady", force=[0.0, -201.0, 0.0]), flight_clock()) as driver:
-            sample = driver.latest()
-            assert sample is not None and sample.overload and sample.force_sensor_n[:2] == (0.0, -201.0)
-
-    asyncio.run(run())
+async def test_a_force_beyond_its_range_counts_as_an_overload() -> None:
+    async with open_force(sensor("steady", force=[0.0, -201.0, 0.0]), flight_clock()) as driver:
+        sample = driver.latest()
+        assert sample is not None and sample.overload and sample.force_sensor_n[:2] == (0.0, -201.0)
 
 
-def test_a_sensor_that_raises_when_it_is_closed_is_closed() -> None:
-    async def run() -> None:
-        async with open_force(sensor("unclosed"), flight_clock()):
-            pass
-
-    asyncio.run(run())
+async def test_a_sensor_that_raises_when_it_is_closed_is_closed() -> None:
+    async with open_force(sensor("unclosed"), flight_clock()):
+        pass
 
 
-def test_records_of_a_net_ft_box_become_newtons() -> None:
-    async def run() -> None:
-        with NetFt() as box:
-            async with open_force(ati(box.port), flight_clock()) as driver:
-                samples = await driver.tare_samples(0.05)
-                assert {sample.force_sensor_n[:2] for sample in samples} == {(1.5, -0.25)}
-                assert samples[-1].torque_sensor_nm == (2.0, -3.0, 0.0) and not samples[-1].overload
-                box.status = 0x80000000
-                while not (await driver.tare_samples(0.002))[0].overload:
-                    pass
-                box.sequence -= 100  # records out of order are ignored
-                assert driver.counts().bad_sums == 0
-
-    asyncio.run(run())
+async def test_records_of_a_net_ft_box_become_newtons() -> None:
+    with NetFt() as box:
+        async with open_force(ati(box.port), flight_clock()) as driver:
+            samples = await driver.tare_samples(0.05)
+            assert {sample.force_sensor_n[:2] for sample in samples} == {(1.5, -0.25)}
+            assert samples[-1].torque_sensor_nm == (2.0, -3.0, 0.0) and not samples[-1].overload
+            box.status = 0x80000000
+            while not (await driver.tare_samples(0.002))[0].overload:
+                pass
+            box.sequence -= 100  # records out of order are ignored
+            assert driver.counts().bad_sums == 0
 
 
-def test_a_record_of_the_wrong_size_ends_the_stream() -> None:
-    async def run() -> None:
-        with NetFt() as box:
-            async with open_force(ati(box.port), flight_clock()) as driver:
-                box.broken = b"short"
-                with pytest.raises(DeviceError, match=r"read\(\) raised error: unpack requires"):
-                    await driver.tare_samples(60.0)
-
-    asyncio.run(run())
+async def test_a_record_of_the_wrong_size_ends_the_stream() -> None:
+    with NetFt() as box:
+        async with open_force(ati(box.port), flight_clock()) as driver:
+            box.broken = b"short"
+            with pytest.raises(DeviceError, match=r"read\(\) raised error: unpack requires"):
+                await driver.tare_samples(60.0)
 
 
 # -- lists and logs ------------------------------------------------------------------------------------------------------------

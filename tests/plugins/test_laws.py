@@ -20,7 +20,8 @@ from companion.cli.schema import schema_json
 from companion.config.loader import load_flight, logged_flight
 from companion.ground.station.replay_log import read_for_page
 from companion.model.codec import fingerprint
-from companion.model.types import Inputs, OperatorCommand, Outputs, Sent
+from companion.model.outputs import Outputs, Sent
+from companion.model.types import Inputs, OperatorCommand
 from companion.plugins import PluginError
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import fly_to_end, row_of

@@ -39,97 +39,11 @@ from companion.runtime.clock import flight_clock, monotonic
 from companion.testing import check_mocap
 from tests.guardian.rig import Cameras
 from tests.plugins.installed import on_path, write_distribution
+from tests.plugins.mocap_systems import FAILING
 from tests.support import DEADLINE_S, ROOT, free_udp_port
 
 EXAMPLE = ROOT / "examples/mocap_vicon"
 VEHICLE = (ROOT / "configs/vehicles/tarot650_2r.yaml").read_text(encoding="utf-8")
-FAILING = '''
-import socket
-from companion.config.base import Model
-from companion.io.mocap.system import ExtendedClient
-from companion.model.markers import Marker, MarkerFrame
-from companion.model.types import MocapPose
-class Options(Model):
-    """Fails."""
-class Failing:
-    options, server_name, problem = Options, "Failing 1.0", None
-    def __init__(self, settings): pass
-    def keep_connected(self, now_s): raise OSError("network\\nis down")
-    def poses(self, now_s): raise RuntimeError("no pose")
-    def close(self): raise RuntimeError("no close")
-class Absent(Failing):
-    def __init__(self, settings): raise OSError("no licence")
-class NoOptions(Failing):
-    options = None
-class Nonsense(Failing):
-    def keep_connected(self, now_s): pass
-    def poses(self, now_s): return ["a pose"]
-class Nameless(Failing):
-    closed = 0
-    @property
-    def server_name(self): raise ValueError("no name")
-    def close(self): Nameless.closed += 1
-class NoProblem(Failing):
-    def keep_connected(self, now_s): pass
-    def poses(self, now_s): return []
-    @property
-    def problem(self): raise ValueError("not connected")
-class Scripted(Failing):
-    number = 0
-    def __init__(self, settings):
-        self.given = {"stamped_after_now_s": 0.0, "x_m": 0.0, "w": 1.0, "tracking_valid": True}
-        for key, value in settings.options.items():
-            self.given[key] = float(value) if isinstance(value, str) else value  # settings have no NaN
-    def keep_connected(self, now_s): pass
-    def close(self): pass
-    def poses(self, now_s):
-        self.number += 1
-        return [MocapPose(
-            stamp_s=now_s + self.given["stamped_after_now_s"], frame_number=self.number,
-            position_world_m=(self.given["x_m"], 0.0, 1.0), attitude_wxyz=(self.given["w"], 0.0, 0.0, 0.0),
-            tracking_valid=self.given["tracking_valid"], marker_error_m=0.0)]
-class WithMarkers(Scripted, ExtendedClient):
-    """Sees the markers that its options give."""
-    sees_markers = True
-    def markers(self):
-        at = tuple(float(value) for value in self.given["at"])
-        count, late_s = int(self.given.get("count", 1)), self.given.get("late_s", 0.0)
-        stamp_s = self.clock() + late_s
-        markers = (Marker(position_world_m=at),) * count if count else "none"
-        return MarkerFrame(stamp_s=stamp_s, exposed_s=stamp_s, frame_number=self.number, markers=markers)
-class Stuck(Scripted):
-    """Repeats its frame number."""
-    def poses(self, now_s):
-        self.number = 6
-        return super().poses(now_s)
-class Reconnecting(Scripted):
-    """Replaces its socket whenever it is called, and raises now and then."""
-    def __init__(self, settings):
-        super().__init__(settings)
-        self.sockets = ()
-        self.connect()
-    def connect(self):
-        before, pair = self.sockets, socket.socketpair()
-        pair[1].send(b"unread")
-        self.sockets = pair[:1]
-        self.peer = pair[1]
-        for old in before:
-            old.close()
-    def keep_connected(self, now_s): self.reconnect()
-    def poses(self, now_s):
-        self.reconnect()
-        if self.number % 3 == 1:
-            self.number += 1
-            raise OSError("connection reset")
-        return super().poses(now_s)
-    def reconnect(self):
-        peer = self.peer
-        self.connect()
-        peer.close()
-    def close(self):
-        self.sockets[0].close()
-        self.peer.close()
-'''
 
 
 @pytest.fixture(autouse=True)
@@ -204,28 +118,22 @@ def check_pose(pose: MocapPose) -> None:
     assert pose.tracking_valid
 
 
-def test_flight_and_guardian_receive_the_same_poses() -> None:
-    async def run() -> None:
-        port, clock = free_udp_port(), flight_clock()
-        device = vicon(port)
-        poses: list[MocapPose] = []
-        client = GuardianMocap(settings_of(device), lambda: 100.0)
-        async with (
-            broadcasting(port, STRANGER, QUAD),
-            MocapDriver(device, clock, poses.append) as driver,
-        ):
-            pose = driver.latest()
-            assert pose is not None and pose is poses[-1] and 0.0 <= clock() - pose.stamp_s < 1.0
-            check_pose(pose)
-            assert driver.server is not None and driver.server.name == "Vicon Tracker, UDP object stream"
-            assert driver.counts().malformed == 0
-            client.keep_connected()
-            seen = client.poses(origin_s=60.0)
-            assert seen and client.tracked_s == 100.0 and 39.0 < seen[-1].stamp_s <= 40.0
-            check_pose(seen[-1])
-        client.close()
-
-    asyncio.run(run())
+async def test_flight_and_guardian_receive_the_same_poses() -> None:
+    port, clock = free_udp_port(), flight_clock()
+    device = vicon(port)
+    poses: list[MocapPose] = []
+    client = GuardianMocap(settings_of(device), lambda: 100.0)
+    async with broadcasting(port, STRANGER, QUAD), MocapDriver(device, clock, poses.append) as driver:
+        pose = driver.latest()
+        assert pose is not None and pose is poses[-1] and 0.0 <= clock() - pose.stamp_s < 1.0
+        check_pose(pose)
+        assert driver.server is not None and driver.server.name == "Vicon Tracker, UDP object stream"
+        assert driver.counts().malformed == 0
+        client.keep_connected()
+        seen = client.poses(origin_s=60.0)
+        assert seen and client.tracked_s == 100.0 and 39.0 < seen[-1].stamp_s <= 40.0
+        check_pose(seen[-1])
+    client.close()
 
 
 def test_the_example_and_a_system_that_answers_every_call_keep_the_contract() -> None:
@@ -292,16 +200,13 @@ def test_options_that_the_system_refuses_break_the_contract() -> None:
         check_mocap(MocapDevice(type="vicon", server="server", rigid_body_id=1))
 
 
-def test_an_object_that_is_not_tracked_is_reported() -> None:
-    async def run() -> None:
-        port = free_udp_port()
-        device = vicon(port)
-        driver = MocapDriver(device, flight_clock(), lambda _: None, body_timeout_s=0.3)
-        async with broadcasting(port, ("quad", (0.0,) * 6)):
-            with pytest.raises(DeviceError, match="rigid body 1 was not tracked within"):
-                await driver.__aenter__()
-
-    asyncio.run(run())
+async def test_an_object_that_is_not_tracked_is_reported() -> None:
+    port = free_udp_port()
+    device = vicon(port)
+    driver = MocapDriver(device, flight_clock(), lambda _: None, body_timeout_s=0.3)
+    async with broadcasting(port, ("quad", (0.0,) * 6)):
+        with pytest.raises(DeviceError, match="rigid body 1 was not tracked within"):
+            await driver.__aenter__()
 
 
 def test_damaged_datagrams_are_rejected() -> None:
@@ -401,15 +306,12 @@ INVALID: list[tuple[dict[str, JsonValue], str]] = [
 
 
 @pytest.mark.parametrize(("options", "expected"), INVALID[:1])
-def test_the_flight_rejects_invalid_poses(options: dict[str, JsonValue], expected: str) -> None:
-    async def run() -> None:
-        delivered: list[MocapPose] = []
-        driver = MocapDriver(scripted(**options), flight_clock(), delivered.append, body_timeout_s=0.01)
-        with pytest.raises(DeviceError, match=f"rigid body 1 was never seen .* the newest problem: .*{expected}"):
-            await driver.__aenter__()
-        assert not delivered and driver.counts().malformed >= 1
-
-    asyncio.run(run())
+async def test_the_flight_rejects_invalid_poses(options: dict[str, JsonValue], expected: str) -> None:
+    delivered: list[MocapPose] = []
+    driver = MocapDriver(scripted(**options), flight_clock(), delivered.append, body_timeout_s=0.01)
+    with pytest.raises(DeviceError, match=f"rigid body 1 was never seen .* the newest problem: .*{expected}"):
+        await driver.__aenter__()
+    assert not delivered and driver.counts().malformed >= 1
 
 
 @pytest.mark.parametrize(("options", "expected"), INVALID)
@@ -485,15 +387,11 @@ def test_a_problem_that_raises_is_reported_by_the_guardian() -> None:
     assert client.poses() == [] and client.problem == "ValueError: not connected"
 
 
-def test_a_call_that_waits_is_reported() -> None:
+async def test_a_call_that_waits_is_reported() -> None:
     times_s = count(step=0.02)
     driver = MocapDriver(scripted(), lambda: next(times_s), lambda _: None)
-
-    async def run() -> None:
-        async with driver:
-            assert driver.counts().problem == "keep_connected() took 20 ms, limit 10 ms; no call of a client may wait"
-
-    asyncio.run(run())
+    async with driver:
+        assert driver.counts().problem == "keep_connected() took 20 ms, limit 10 ms; no call of a client may wait"
 
 
 @pytest.mark.parametrize(
@@ -503,21 +401,17 @@ def test_a_call_that_waits_is_reported() -> None:
         ("nonsense", r"TypeError: poses\(\) returned \['a pose'\], expected a list of MocapPose"),
     ],
 )
-def test_exceptions_of_a_client_are_contained(system: str, expected: str) -> None:
+async def test_exceptions_of_a_client_are_contained(system: str, expected: str) -> None:
     device = MocapDevice(type=system, server="server", rigid_body_id=1)
     client = GuardianMocap(settings_of(device))
     client.keep_connected()
     assert client.poses() == [] and client.tracked_s < 0.0
     client.close()
     assert client.problem is not None and re.match(expected, client.problem)
-
-    async def run() -> None:
-        driver = MocapDriver(device, flight_clock(), lambda _: None, body_timeout_s=0.1)
-        with pytest.raises(DeviceError, match=f"rigid body 1 was never seen .* the newest problem: {expected}"):
-            await driver.__aenter__()
-        assert driver.counts().malformed >= 2
-
-    asyncio.run(run())
+    driver = MocapDriver(device, flight_clock(), lambda _: None, body_timeout_s=0.1)
+    with pytest.raises(DeviceError, match=f"rigid body 1 was never seen .* the newest problem: {expected}"):
+        await driver.__aenter__()
+    assert driver.counts().malformed >= 2
 
 
 def test_a_client_that_cannot_be_made_refuses_the_flight() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -140,6 +141,13 @@ RAISES = {
     "expects": ("    def begin(", "    def expects(self, own):\n        return None\n\n    def begin("),
     "leave": ("    def begin(", "    def leave(self, own, t_s):\n        return own.n\n\n    def begin("),
 }
+SOON = [
+    "mission.catch=null",
+    "mission.phases[0]={type: takeoff, height_m: 0.9, duration_s: 2.5}",
+    "mission.phases[2]={type: arm, arm_deg: unfolded}",
+    "mission.phases[3].duration_s=0.1",
+]
+"""The mission without its way: it weighs some seconds after the take-off, high enough to hold."""
 
 
 @pytest.mark.parametrize("method", list(RAISES))
@@ -147,13 +155,14 @@ def test_a_phase_that_raises_in_the_air_is_named_and_the_vehicle_lands(site: Pat
     right, wrong = RAISES[method]
     assert right in CODE
     (site / "lab_weigh.py").write_text(CODE.replace(right, wrong))
-    flight = FastFlight(load_sitl(MISSION))
-    result = flight.run()
+    flight = FastFlight(load_sitl(MISSION, overrides=SOON))
+    ticks = itertools.count()
+    result = flight.run(until=(lambda o: o.phase == "weigh" and next(ticks) == 20) if method == "leave" else None)
     outputs = result.outputs
     if method == "leave":  # a hold during the phase
-        core, during = FlightCore(flight.config.flight), [o.phase for o in outputs].index("weigh") + 20
-        outputs = [core.step(inputs) for inputs in result.inputs[:during]]
-        outputs.append(core.step(replace(result.inputs[during], command=OperatorCommand.HOLD)))
+        core = FlightCore(flight.config.flight)
+        outputs = [core.step(inputs) for inputs in result.inputs]
+        outputs.append(core.step(replace(result.inputs[-1], command=OperatorCommand.HOLD)))
     else:
         assert not result.crashed and outputs[-1].outcome is Outcome.ABORTED
         assert SafetyAction.AUTOPILOT_LAND not in {output.action for output in outputs}, "lands under its own control"

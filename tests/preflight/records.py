@@ -11,14 +11,7 @@ from msgspec.structs import replace
 from companion.config.loader import FlightConfig, load_flight
 from companion.model.estimator import EstimatorReport
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.observations import (
-    ForceStream,
-    Machine,
-    MocapStream,
-    Observations,
-    ServoReport,
-    StateCounts,
-)
+from companion.model.observations import ForceStream, Machine, MocapStream, Observations, ServoReport, StateCounts
 from companion.model.types import (
     ArmState,
     AutopilotStatus,

@@ -21,7 +21,8 @@ from companion.px4.versions import has
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel, ServoRefusal
 from sitl.servo.protocol import StatusError
-from tests.support import CATCH, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, serial_line, set_options
+from tests.support import CATCH, HOVER, Ended, Sandbox, World, read_summary, sandbox_in, set_options
+from tests.wires import serial_line
 
 OPERATING_MODE, MODE_POSITION = 11, 3
 

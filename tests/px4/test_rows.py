@@ -278,10 +278,7 @@ PX4_QUAD_X = {
             "CA_ROTOR0 is 45 deg to the left, ccw (vehicle file: 45 deg to the right, ccw); "
             "CA_ROTOR2 is 45 deg to the right, cw (vehicle file: 45 deg to the left, cw)",
         ),
-        (
-            {"CA_ROTOR3_KM": 0.05},
-            "CA_ROTOR3 is 135 deg to the right, ccw (vehicle file: 135 deg to the right, cw)",
-        ),
+        ({"CA_ROTOR3_KM": 0.05}, "CA_ROTOR3 is 135 deg to the right, ccw (vehicle file: 135 deg to the right, cw)"),
         ({"CA_ROTOR3_KM": 0.0}, "CA_ROTOR3 is 135 deg to the right, without yaw torque"),
         (dict.fromkeys((f"CA_ROTOR{i}_P{axis}" for i in range(4) for axis in "XY"), 0.0), "CA_ROTOR0 is at the centre"),
     ],

@@ -10,7 +10,8 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from companion.config.loader import load_flight
-from companion.model.types import Inputs, Outputs, Sent, TetherState
+from companion.model.outputs import Outputs, Sent, TetherState
+from companion.model.types import Inputs
 from companion.recorder.client import RecorderProcess
 from sitl.fast.loop import FastResult
 from tests.analysis.synthetic_flight import synthetic_flight

@@ -22,7 +22,8 @@ from companion.config.loader import FlightConfig, load_flight
 from companion.ground.protocol.commands import make_command
 from companion.ground.protocol.keys import Operator, load_login, new_key, operators_text, write_private
 from companion.ground.protocol.messages import Stream, Topic, decode, encode, vehicle_of
-from companion.model.types import Inputs, OperatorCommand, Outputs, Sent
+from companion.model.outputs import Outputs, Sent
+from companion.model.types import Inputs, OperatorCommand
 from companion.recorder.client import RecorderProcess, RecorderReport
 from tests.analysis.synthetic_flight import synthetic_flight
 from tests.support import CATCH, DEADLINE_S, wait_until

@@ -20,6 +20,7 @@ from mcap.reader import NonSeekingReader, make_reader
 
 from companion.io.protocols import DeviceError
 from companion.model.codec import differences, from_json
+from companion.model.outputs import Outputs, Sent
 from companion.model.packets import CommandAnswer, read_packet
 from companion.model.types import (
     AutopilotRequest,
@@ -28,10 +29,8 @@ from companion.model.types import (
     Inputs,
     MocapPose,
     OperatorCommand,
-    Outputs,
     PhaseKind,
     SafetyAction,
-    Sent,
     Severity,
 )
 from companion.recorder.client import RecorderClient, RecorderProcess, epoch_offset_ns

@@ -19,7 +19,8 @@ from companion.model.codec import Record, differences
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.hanging_line import hanging_line_m
 from companion.model.markers import BallState
-from companion.model.types import Joints, MocapPose, Quat, TetherState, Vec3
+from companion.model.outputs import TetherState
+from companion.model.types import Joints, MocapPose, Quat, Vec3
 from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
 from tests.machines import overrides_with_joints

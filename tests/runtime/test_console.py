@@ -9,7 +9,7 @@ from rich.console import Console
 
 from companion.flight.control_loop import status_of
 from companion.model.launcher_messages import AnyMessage, FlightEvent, Started
-from companion.model.types import Outputs
+from companion.model.outputs import Outputs
 from companion.runtime.console import FlightDisplay, print_result
 from companion.runtime.realtime import Realtime
 from companion.sitl_config.loader import load_sitl

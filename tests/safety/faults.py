@@ -11,12 +11,8 @@ import msgspec
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
-from companion.model.types import (
-    ControlLog,
-    FlightMode,
-    Inputs,
-    OperatorCommand,
-)
+from companion.model.outputs import ControlLog
+from companion.model.types import FlightMode, Inputs, OperatorCommand
 from companion.safety.flight_context import FlightContext
 from companion.safety.rule import Rule, Subject
 from companion.safety.rules import RULES

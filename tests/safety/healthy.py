@@ -11,11 +11,11 @@ import msgspec
 from companion.config.vehicle import Vehicle
 from companion.model.estimator import EstimatorReport
 from companion.model.frames import quat_from_euler_zyx
+from companion.model.outputs import ControlLog, TetherState
 from companion.model.types import (
     ArmState,
     AutopilotStatus,
     Chi,
-    ControlLog,
     Event,
     FlightMode,
     ForceSample,
@@ -23,7 +23,6 @@ from companion.model.types import (
     LandedState,
     MocapPose,
     OperatorCommand,
-    TetherState,
     VehicleState,
 )
 from companion.safety.flight_context import FlightContext

@@ -15,7 +15,8 @@ from msgspec.structs import replace
 from companion.config.loader import FlightConfig, load_flight
 from companion.mission.plan import Plan
 from companion.mission.reference import at_rest
-from companion.model.types import Reference, TetherState, Vec3
+from companion.model.outputs import TetherState
+from companion.model.types import Reference, Vec3
 from companion.safety.governor import Governed, Governor, SafeSet, _share_within
 from tests.support import tether_of
 

@@ -12,11 +12,7 @@ from companion.model.types import Event, SafetyAction, Severity
 from companion.safety.notices import HOLD_EXPIRED, RETRACT_EXPIRED
 from companion.safety.rules import OPERATOR_RESUME as RESUME
 from companion.safety.rules import RULES
-from companion.safety.supervisor import (
-    EscalationTimeouts,
-    SupervisorState,
-    update,
-)
+from companion.safety.supervisor import EscalationTimeouts, SupervisorState, update
 
 TIMES = EscalationTimeouts(hold_max_s=20.0, retract_max_s=12.0)
 EVENTS = [(rule.id, rule.air) for rule in RULES if rule.air is not None]

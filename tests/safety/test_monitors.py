@@ -7,12 +7,7 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from companion.model.types import (
-    Event,
-    Inputs,
-    OperatorCommand,
-    SafetyAction,
-)
+from companion.model.types import Event, Inputs, OperatorCommand, SafetyAction
 from companion.safety.arm import error_text
 from companion.safety.flight_context import FlightContext
 from companion.safety.monitors import Monitors
@@ -30,17 +25,7 @@ from tests.safety.faults import (
     replace,
     slow_link,
 )
-from tests.safety.healthy import (
-    START_S,
-    TICK_S,
-    after_a_moment,
-    flying,
-    healthy,
-    put,
-    standing,
-    stopped,
-    watched,
-)
+from tests.safety.healthy import START_S, TICK_S, after_a_moment, flying, healthy, put, standing, stopped, watched
 
 
 def test_vision_that_has_never_been_fused_is_not_lost() -> None:

@@ -5,11 +5,7 @@ from __future__ import annotations
 import pytest
 
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
-from companion.model.types import (
-    Inputs,
-    MocapPose,
-    SafetyAction,
-)
+from companion.model.types import Inputs, MocapPose, SafetyAction
 from companion.safety.flight_context import FlightContext
 from companion.safety.mocap import unfused
 from companion.safety.monitors import Monitors

@@ -9,36 +9,13 @@ from typing import Any
 import pytest
 
 from companion.config.vehicle import Vehicle
-from companion.model.types import (
-    Inputs,
-    SafetyAction,
-    Severity,
-)
+from companion.model.types import Inputs, SafetyAction, Severity
 from companion.safety.flight_context import FlightContext
 from companion.safety.monitors import Monitors
 from companion.safety.rule import Rule
 from companion.safety.rules import RULES
-from tests.safety.faults import (
-    EXTERNAL,
-    FAULTS,
-    FOUND,
-    RULE,
-    VEHICLE,
-    Fault,
-    replace,
-    seen_by,
-    turned,
-)
-from tests.safety.healthy import (
-    START_S,
-    TICK_S,
-    after_a_moment,
-    fed_by_another,
-    flying,
-    healthy,
-    standing,
-    watched,
-)
+from tests.safety.faults import EXTERNAL, FAULTS, FOUND, RULE, VEHICLE, Fault, replace, seen_by, turned
+from tests.safety.healthy import START_S, TICK_S, after_a_moment, fed_by_another, flying, healthy, standing, watched
 
 NOMINAL, WARN, HOLD, RETRACT = SafetyAction.NOMINAL, SafetyAction.WARN, SafetyAction.HOLD, SafetyAction.RETRACT
 

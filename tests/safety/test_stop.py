@@ -19,10 +19,7 @@ def model(react_s: float = Safety().react_time_s, deceleration_m_s2: float = 2.0
     return StopModel(Safety(react_time_s=react_s, stop_deceleration_m_s2=deceleration_m_s2))
 
 
-@pytest.mark.parametrize(
-    ("speed_m_s", "drift_m"),
-    [(0.625, 0.45), (0.8, 0.65), (1.13, 0.75)],
-)
+@pytest.mark.parametrize(("speed_m_s", "drift_m"), [(0.625, 0.45), (0.8, 0.65), (1.13, 0.75)])
 def test_it_covers_the_drift_of_a_real_px4(speed_m_s: float, drift_m: float) -> None:
     """PX4 1.16.1, companion hung in flight: docs/internals/px4.md."""
     assert model().distance_m(speed_m_s) >= drift_m

@@ -1,4 +1,4 @@
-"""The tether watch: geometry against closed forms and brute force, pull and snag in the closed loop, and what must not alarm it."""
+"""The tether watch: geometry against closed forms and brute force, and pull and snag. In flights: test_tether_flights.py."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from hypothesis import strategies as st
 from companion.config.vehicle import Vehicle
 from companion.model.algebra import plus
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
-from companion.model.types import Joints, Outcome, Outputs, PhaseKind, Quat, SafetyAction, TetherState, Vec3
+from companion.model.outputs import TetherState
+from companion.model.types import Joints, Quat, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 from companion.safety.tether_pull import PullEstimate
 from companion.safety.tether_shape import Clearance, steepest_slope
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import FastFlight, FastResult
-from sitl.world.state import Truth
 from tests.support import tether_of
 
 LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
@@ -419,78 +418,6 @@ def test_without_knowledge_of_forces_there_is_no_pull() -> None:
     states = pulled(2.0, lambda t_s, p: None if t_s >= 1.5 else along(8.0)(t_s, p))
     assert states[290].snagged
     assert (states[-1].pull_n, states[-1].snagged) == (0.0, False)
-
-
-# -- closed loop -------------------------------------------------------------------------------------------------------
-
-
-def event_ids(result: FastResult) -> list[str]:
-    return [event.id for outputs in result.outputs for event in outputs.events]
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ("world.payload_kg=0.1", "world.wind_m_s=[3, 0, 0]"),
-        ("world.payload_kg=0.4", "world.hover_thrust_error=-0.1"),
-    ],
-)
-def test_an_ordinary_flight_raises_no_alarm(overrides: tuple[str, ...]) -> None:
-    result = FastFlight(config(*overrides)).run(until_mission_s=11.0)
-    assert event_ids(result) == ["takeoff", "catch"]
-    assert all(o.action is SafetyAction.NOMINAL and not o.limited_by and o.mocap_trusted for o in result.outputs)
-    states = [o.tether for o in result.outputs if o.tether is not None and o.phase_kind is PhaseKind.FLIGHT]
-    assert len(states) > 1000
-    assert not any(state.taut or state.snagged or state.separated for state in states)
-    assert max(state.pull_n for state in states) < 2.3
-    assert min(state.clearance_m for state in states) > tether_of(vehicle()).clearance_min_m
-    assert max(abs(state.turns) for state in states) < 0.5
-
-
-def test_wind_of_5_m_s_from_ahead_is_no_tether_that_pulls() -> None:
-    """It presses with 4 to 6 N, mostly by the rotors' drag. The tilt against it brings the rotors nearer to the line."""
-    result = FastFlight(config("world.rotors={on: true, drag_s_m: 0.03}", "world.wind_m_s=[-5, 0, 0]")).run(
-        until_mission_s=11.0
-    )
-    assert set(event_ids(result)) - {"tether_near"} == {"takeoff", "catch"}
-    assert all(o.action.rank <= SafetyAction.WARN.rank for o in result.outputs)
-
-
-def snag(flight: FastFlight, at_s: float, anchor: Vec3, extra_m: float) -> None:
-    """From `at_s` after arming on the line is held at `anchor`, and is that much longer than it is away."""
-    step, plant = flight.plant.step, flight.plant
-    done = False
-
-    def hooked(armed: bool) -> None:
-        nonlocal done
-        now_s = plant.mission_t_s()
-        if not done and now_s is not None and now_s >= at_s:
-            done = True
-            scene = plant.scene
-            scene.model.site_pos[scene.model.site("anchor").id] = anchor
-            scene.model.tendon_range[0, 1] = math.dist(anchor, plant.truth.position_world_m) + extra_m
-        step(armed)
-
-    flight.plant.step = hooked  # type: ignore[method-assign]
-
-
-def first_s(result: FastResult, is_so: Callable[[Outputs, Truth], bool]) -> float:
-    return next(truth.t_s for outputs, truth in zip(result.outputs, result.truth, strict=True) if is_so(outputs, truth))
-
-
-@pytest.mark.parametrize(("at_s", "anchor"), [(9.0, ANCHOR), (14.0, (1.5, 1.5, 0.0))])
-def test_a_snagged_line_is_noticed_and_the_machine_lands(at_s: float, anchor: Vec3) -> None:
-    flight = FastFlight(config("world.payload_kg=0.2"))
-    snag(flight, at_s, anchor, 0.02)
-    result = flight.run(60.0)
-    tight_s = first_s(result, lambda _, truth: truth.tether_tension_n > 1.0)
-    seen_s = first_s(
-        result, lambda outputs, _: bool(outputs.tether and (outputs.tether.snagged or outputs.tether.taut))
-    )
-    assert 0.0 < seen_s - tight_s < 2.0
-    assert not result.crashed
-    assert result.outputs[-1].outcome is Outcome.ABORTED
-    assert set(event_ids(result)) & {"tether_taut", "tether_snagged"}
 
 
 def test_an_arm_that_leaves_its_plane_is_a_ball_about_its_first_joint() -> None:

@@ -9,12 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.autopilot.params import (
-    MAV_PARAM_TYPE_INT32,
-    Params,
-    decode_bytewise,
-    encode_bytewise,
-)
+from sitl.autopilot.params import MAV_PARAM_TYPE_INT32, Params, decode_bytewise, encode_bytewise
 
 
 @given(st.integers(-(2**31), 2**31 - 1))

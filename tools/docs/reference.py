@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.cli.schema import KINDS, Described
+from companion.model.units import unit_of
 
 Schema = dict[str, Any]
 _INTRO = {
@@ -27,24 +28,6 @@ _INTRO = {
     "`--set world.KEY=VALUE`. Any number may be a distribution, `{uniform: [low, high]}` or `{normal: [mean, sigma]}`, from which the "
     "seed draws it. With examples: [the laboratory](../world.md), [the simulated world](../sitl.md#knobs).",
 }
-_UNITS = {
-    "kg_m2": "kg m^2", "nm_a": "N m/A", "n_per_m": "N/m", "per_s": "1/s", "m_s": "m/s", "m_s2": "m/s^2", "m_s3": "m/s^3",
-    "deg_s": "deg/s", "deg_s2": "deg/s^2", "deg_s3": "deg/s^3", "rad_s": "rad/s", "nms": "N m s", "nm": "N m", "kg": "kg",
-    "deg": "deg", "hz": "Hz", "ms": "ms", "us": "us", "m": "m", "s": "s", "n": "N", "v": "V", "a": "A", "c": "degC",
-    "counts": "counts", "count": "counts",
-}  # fmt: skip
-_NO_UNIT = {"row_weights_s"}
-"""Keys without a unit whose names nevertheless end like a unit."""
-
-
-def unit(key: str) -> str:
-    """Return the unit that the end of a key's name denotes, or an empty string."""
-    words = key.split("_")
-    for first in range(1, len(words)):
-        found = _UNITS.get("_".join(words[first:]))
-        if found is not None:
-            return "" if key in _NO_UNIT else found
-    return ""
 
 
 def page(kind: str) -> str:
@@ -127,7 +110,7 @@ def _section(path: str, model: Schema, definitions: dict[str, Schema]) -> list[s
         default = "required" if key in wanted else _default(value)
         path_below = f"{place}.{key}" if place and not kind else key
         kinds = _type(value, definitions).replace("section", f"[section](#{_anchor(path_below)})")
-        cells = [f"`{key}`", kinds, unit(key), _range(value), default, _meaning(value)]
+        cells = [f"`{key}`", kinds, unit_of(key) or "", _range(value), default, _meaning(value)]
         lines.append("| " + " | ".join(cells) + " |")
     return lines
 

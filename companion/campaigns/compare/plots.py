@@ -7,8 +7,8 @@ Needs matplotlib (extra `analysis`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from itertools import product
+from collections.abc import Sequence
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +90,7 @@ def _strips(title: str, groups: Sequence[Group]) -> Figure:
     payloads = sorted({group.payload_kg for group in groups})
     shown = {group.label: short_label(group.controller, group.preset).strip() for group in groups}
     labels = list(shown)
-    colours = _colours(labels)
+    colours = dict(zip(labels, cycle(COLOURS), strict=False))
     figure = new_figure(1.3 + len(payloads) * (0.35 + 0.24 * len(labels)))
     axes = figure.subplots(len(payloads), 2, sharex=True, sharey=True, squeeze=False)
     for (row, payload_kg), (column, part) in product(enumerate(payloads), enumerate(PARTS)):
@@ -215,11 +215,6 @@ def _log_metres(ax: Any, *names: str) -> None:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=30))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_formatter(NullFormatter())
-
-
-def _colours(labels: Iterable[str]) -> dict[str, str]:
-    """Return a colour for each label, the same in every picture."""
-    return {label: COLOURS[k % len(COLOURS)] for k, label in enumerate(dict.fromkeys(labels))}
 
 
 def _array(values: Sequence[float | None]) -> Array:

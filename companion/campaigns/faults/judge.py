@@ -14,13 +14,10 @@ from dataclasses import dataclass
 from companion.campaigns.faults.variants import Variant
 from companion.campaigns.runner import Row
 from companion.config.vehicle import Vehicle
-from companion.model.types import Event, Outcome, Outputs, PhaseKind, SafetyAction, Vec3
+from companion.model.outputs import Outputs
+from companion.model.types import Event, Outcome, PhaseKind, SafetyAction, Vec3
 from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
 
-COLUMNS = (
-    "fault", "phase", "size", "unit", "duration_s", "outcome", "detected_s", "event", "reacted_s", "action", "worst_tilt_deg",
-    "min_height_m", "min_slack_m", "drift_m", "contact_n", "caught", "problems", "events", "error",
-)  # fmt: skip
 GOOD = ("completed", "landed")
 TAUT_N = 0.5
 """Tension above which the tether is taut; smaller values are noise of the contact solver."""

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from companion.config.controller import ControllerConfig, LawConfig, fitted, six_digits
+from companion.config.controller import ControllerConfig, LawConfig
+from companion.config.gains import fitted, six_digits
 from companion.config.tuned_gain import EACH, TunedGain
 from companion.config.vehicle import Vehicle
 from companion.control.scaled_gains import joint_inertia_kg_m2, written_for

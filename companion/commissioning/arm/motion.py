@@ -37,9 +37,11 @@ _LEAD_RAD: Final = math.radians(5.0)
 """Lag of a joint behind its reference at which the reference stops and waits."""
 
 
-def gentle(arm: Arm, share: float = TORQUE_SHARE) -> Arm:
-    """Return the arm's configuration with this fraction of the torque limits, to which the driver clips every command."""
-    joints = tuple(joint.model_copy(update={"torque_max_nm": share * joint.torque_max_nm}) for joint in arm.joints)
+def gentle(arm: Arm) -> Arm:
+    """Return the arm's configuration with `TORQUE_SHARE` of the torque limits, to which the driver clips every command."""
+    joints = tuple(
+        joint.model_copy(update={"torque_max_nm": TORQUE_SHARE * joint.torque_max_nm}) for joint in arm.joints
+    )
     return arm.model_copy(update={"joints": joints})
 
 

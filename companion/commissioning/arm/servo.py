@@ -14,7 +14,7 @@ from companion.config.document import ConfigError
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import Register
 from companion.model.servos import COUNTS_PER_TURN, ServoKind, kind_of
-from companion.preflight.arm import MODES
+from companion.preflight.arm import mode_text
 
 SETTINGS: Final = (
     bus.ID, bus.BAUD, dxl.RETURN_DELAY, dxl.DRIVE_MODE, dxl.OPERATING_MODE, dxl.SECONDARY_ID, dxl.HOMING_OFFSET, dxl.PWM_LIMIT,
@@ -127,7 +127,7 @@ def settings(servo: FoundServo, index: int, arm: Arm, device: ArmDevice) -> list
     delay = dxl.RETURN_DELAY_UNIT_US
     rows: list[tuple[Register, int, Callable[[int], str], str]] = [
         (dxl.RETURN_DELAY, 0, lambda v: f"{v * delay} us", "the factory setting of 500 us per servo takes a fifth of a control tick"),
-        (dxl.OPERATING_MODE, dxl.MODE_CURRENT, _mode_text, "the companion commands currents"),
+        (dxl.OPERATING_MODE, dxl.MODE_CURRENT, mode_text, "the companion commands currents"),
         *((register, wanted, _SHOWN.get(register, str), why) for register, wanted, why in dxl.REQUIRED),
         (dxl.CURRENT_LIMIT, wanted_limit, str, f"torque_max_nm {joint.torque_max_nm:g} needs {needed}"),
         (bus.MIN_POSITION_LIMIT, 0, str, "the companion itself enforces the joint limits"),
@@ -199,10 +199,6 @@ def is_strange(servo: FoundServo, arm: Arm) -> bool:
 def baud_text(value: int) -> str:
     """Return a value of register 8 as a rate."""
     return str(bus.BAUDS[value]) if value < len(bus.BAUDS) else f"value {value}"
-
-
-def _mode_text(mode: int) -> str:
-    return f"{mode} ({MODES.get(mode, 'unknown')})"
 
 
 def _drive_text(mode: int) -> str:

@@ -15,7 +15,8 @@ from companion.commissioning.identify.response import STEP_S
 from companion.config.vehicle import Vehicle
 from companion.control.hover_thrust import AIRBORNE_M
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import Inputs, Outcome, Outputs, PhaseKind, Sent
+from companion.model.outputs import Outputs, Sent
+from companion.model.types import Inputs, Outcome, PhaseKind
 
 FLIGHT_MIN_S = 8.0
 """Shortest flight in the air from which anything can be found."""

@@ -50,9 +50,9 @@ class LatencyLink(MavsdkAutopilot):
     def __init__(self, device: AutopilotDevice, clock: Clock) -> None:
         super().__init__(device, clock)
         self._now = clock
-        self._keep_flight_state = self._readers[messages.HIGHRES_IMU_ID]
+        self._keep_flight_state = self._inbox.readers[messages.HIGHRES_IMU_ID]
         self._asked_ns: set[int] = set()
-        self._asking: asyncio.Task[None] | None = None
+        self._syncing: asyncio.Task[None] | None = None
         self.syncs: list[Sync] = []
         self._raw: list[tuple[float, float, ImuAt]] = []
 
@@ -64,9 +64,9 @@ class LatencyLink(MavsdkAutopilot):
         """
         await super().__aenter__()
         try:
-            self._readers[messages.HIGHRES_IMU_ID] = self._on_imu
-            self._readers[_TIMESYNC_ID] = self._on_sync
-            self._asking = asyncio.create_task(self._ask_clock(), name="timesync")
+            self._inbox.readers[messages.HIGHRES_IMU_ID] = self._on_imu
+            self._inbox.readers[_TIMESYNC_ID] = self._on_sync
+            self._syncing = asyncio.create_task(self._ask_clock(), name="timesync")
             await self._first_answers()
         except BaseException:
             await self.__aexit__(None, None, None)
@@ -75,9 +75,9 @@ class LatencyLink(MavsdkAutopilot):
 
     async def __aexit__(self, *_: object) -> None:
         """Stop the requests, then close the link."""
-        if self._asking is not None:
-            self._asking.cancel()
-            await asyncio.wait((self._asking,))
+        if self._syncing is not None:
+            self._syncing.cancel()
+            await asyncio.wait((self._syncing,))
         await super().__aexit__(None, None, None)
 
     def imu(self, last_s: float = math.inf) -> list[ImuAt]:
@@ -128,9 +128,7 @@ class LatencyLink(MavsdkAutopilot):
         self._raw.append((arrived_s, 1e-6 * time_us, sample))
 
     def _on_sync(self, arrived_s: float, payload: bytes) -> None:
-        self._take_sync(arrived_s, *_TIMESYNC.unpack_from(payload.ljust(_TIMESYNC.size, b"\0")))
-
-    def _take_sync(self, arrived_s: float, px4_ns: int, asked_ns: int) -> None:
+        px4_ns, asked_ns = _TIMESYNC.unpack_from(payload.ljust(_TIMESYNC.size, b"\0"))
         if px4_ns == 0 or asked_ns not in self._asked_ns:
             return  # PX4's own request, or an answer to another program
         self._asked_ns.discard(asked_ns)

@@ -36,7 +36,6 @@ DELAY = Check(
 NETWORK = Check(
     "mocap.network", "route to the server", why="Wi-Fi delays frames and delivers them in bursts", warns=True
 )
-CHECKS = (SERVER, OWN, STEADY, DELAY, NETWORK)
 
 MOVED_MIN_M: Final = 0.05
 RATE_TOLERANCE: Final = 0.05

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from companion.control.arm_model.chain_kinematics import ChainKinematics, Frame
 from companion.control.dynamics import ArmTerms, Dynamics, DynamicsTerms, euler_rate_matrices
-from companion.model.algebra import cross, dot, mat_mat, mat_vec, transpose, vec_mat
+from companion.model.algebra import cross, dot, mat_mat, mat_vec, plus, transpose, vec_mat
 from companion.model.arm_chain import ArmChain
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Chi, Joints, Mat3, Vec3
@@ -75,7 +75,7 @@ class ChainDynamics(Dynamics):
         still = (0.0,) * len(frames)
         turning, force, joint_torques = _newton_euler(bodies, axes, omega, chi_rate[6:], still)
         moment, inertia = arm[1], _sum(self._base, arm[2])
-        turning = _plus(turning, cross(omega, mat_vec(self._base, omega)))
+        turning = plus(turning, cross(omega, mat_vec(self._base, omega)))
 
         # M_p,omega = -[h]x, carried to chi: R (-[h]x) W.
         hx, hy, hz = moment
@@ -87,8 +87,8 @@ class ChainDynamics(Dynamics):
 
         # C chi' = T' (c + M [0; W' q'; 0]).
         extra = mat_vec(w_rate, q_rate)
-        c_p = mat_vec(rotation, _plus(force, mat_vec(minus_h, extra)))
-        c_q = vec_mat(_plus(turning, mat_vec(inertia, extra)), w)
+        c_p = mat_vec(rotation, plus(force, mat_vec(minus_h, extra)))
+        c_q = vec_mat(plus(turning, mat_vec(inertia, extra)), w)
         c_a = [torque + dot(angular, extra) for torque, (angular, _) in zip(joint_torques, momenta, strict=True)]
         g_q = vec_mat(cross(moment, up), w)
         g_a = [dot(linear, up) for _, linear in momenta]
@@ -108,7 +108,7 @@ class ChainDynamics(Dynamics):
         """Return every link in body axes."""
         bodies: list[_Body] = []
         for (rotation, position, _), (mass, com, inertia) in zip(frames, self._links, strict=True):
-            x, y, z = _plus(position, mat_vec(rotation, com))
+            x, y, z = plus(position, mat_vec(rotation, com))
             mx, my, mz = mass * x, mass * y, mass * z
             (xx, xy, xz), (_, yy, yz), (_, _, zz) = mat_mat(rotation, mat_mat(inertia, transpose(rotation)))
             xx, yy, zz = xx + my * y + mz * z, yy + mx * x + mz * z, zz + mx * x + my * y
@@ -137,7 +137,7 @@ def _momentum(body: _Body, omega: Vec3, velocity: Vec3) -> _Pair:
     mass, moment, inertia = body
     x, y, z = cross(omega, moment)
     vx, vy, vz = velocity
-    return _plus(mat_vec(inertia, omega), cross(moment, velocity)), (x + mass * vx, y + mass * vy, z + mass * vz)
+    return plus(mat_vec(inertia, omega), cross(moment, velocity)), (x + mass * vx, y + mass * vy, z + mass * vz)
 
 
 def _composites(bodies: list[_Body], axes: list[_Pair]) -> tuple[_Body, list[_Pair]]:
@@ -146,7 +146,7 @@ def _composites(bodies: list[_Body], axes: list[_Pair]) -> tuple[_Body, list[_Pa
     momenta: list[_Pair] = []
     for number in range(len(bodies) - 1, -1, -1):
         mass, moment, inertia = bodies[number]
-        whole = (whole[0] + mass, _plus(whole[1], moment), _sum(whole[2], inertia))
+        whole = (whole[0] + mass, plus(whole[1], moment), _sum(whole[2], inertia))
         axis, at_origin = axes[number]
         momenta.append(_momentum(whole, axis, at_origin))
     momenta.reverse()
@@ -162,19 +162,19 @@ def _newton_euler(
     w, v, dw, dv = omega, _ZERO, _ZERO, _ZERO
     forces: list[_Pair] = []
     for body, (axis, at_origin), rate, acceleration in zip(bodies, axes, rate_rad_s, acceleration_rad_s2, strict=True):
-        turned = _plus(cross(w, at_origin), cross(v, axis))
+        turned = plus(cross(w, at_origin), cross(v, axis))
         dw = _plus_two(dw, rate, cross(w, axis), acceleration, axis)
         dv = _plus_two(dv, rate, turned, acceleration, at_origin)
         w, v = _plus_one(w, rate, axis), _plus_one(v, rate, at_origin)
         angular, linear = _momentum(body, w, v)
         torque, force = _momentum(body, dw, dv)
-        torque = _plus(torque, _plus(cross(w, angular), cross(v, linear)))
-        forces.append((torque, _plus(force, cross(w, linear))))
+        torque = plus(torque, plus(cross(w, angular), cross(v, linear)))
+        forces.append((torque, plus(force, cross(w, linear))))
     torque, force = _ZERO, _ZERO
     joint_torques: list[float] = []
     for number in range(len(bodies) - 1, -1, -1):
         own_torque, own_force = forces[number]
-        torque, force = _plus(torque, own_torque), _plus(force, own_force)
+        torque, force = plus(torque, own_torque), plus(force, own_force)
         axis, at_origin = axes[number]
         joint_torques.append(dot(axis, torque) + dot(at_origin, force))
     joint_torques.reverse()
@@ -200,10 +200,6 @@ def _links_with_tool(chain: ArmChain) -> list[tuple[float, Vec3, Mat3]]:
     return links
 
 
-def _plus(a: Vec3, b: Vec3) -> Vec3:
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
-
-
 def _plus_one(a: Vec3, factor: float, b: Vec3) -> Vec3:
     return (a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2])
 
@@ -217,7 +213,7 @@ def _plus_two(a: Vec3, first: float, b: Vec3, second: float, c: Vec3) -> Vec3:
 
 
 def _sum(m: Mat3, n: Mat3) -> Mat3:
-    return (_plus(m[0], n[0]), _plus(m[1], n[1]), _plus(m[2], n[2]))
+    return (plus(m[0], n[0]), plus(m[1], n[1]), plus(m[2], n[2]))
 
 
 def _times(factor: float, m: Mat3) -> Mat3:

@@ -197,7 +197,7 @@ class DeviceHealth(Record, frozen=True):
 
 
 class TetherView(Record, frozen=True, kw_only=True):
-    """State of the tether for display; see `companion.model.types.TetherState`."""
+    """State of the tether for display; see `companion.model.outputs.TetherState`."""
 
     slack_m: float
     stop_slack_m: float
@@ -208,7 +208,7 @@ class TetherView(Record, frozen=True, kw_only=True):
 
 
 class ControlView(Record, frozen=True, kw_only=True):
-    """Internal values of the controller; see `companion.model.types.ControlLog`."""
+    """Internal values of the controller; see `companion.model.outputs.ControlLog`."""
 
     rho: float
     h_hat: Vec4
@@ -223,10 +223,10 @@ class ControlView(Record, frozen=True, kw_only=True):
 
 
 class ContactView(Record, frozen=True, kw_only=True):
-    """Contact with a surface; see `companion.model.types.ContactState`."""
+    """Contact with a surface; see `companion.model.contact.ContactState`."""
 
     mode: str
-    """`companion.model.types.ContactMode`."""
+    """`companion.model.contact.ContactMode`."""
     force_n: float
     """Measured force of the surface against the direction of the approach."""
     wanted_n: float
@@ -278,7 +278,7 @@ class Stream(Record, frozen=True, kw_only=True):
     action: str
     """`companion.model.types.SafetyAction`."""
     hold: int | None = None
-    """Number of the current hold, `companion.model.types.Sent.hold`, which `resume` names; None if the vehicle does not hold."""
+    """Number of the current hold, `companion.model.outputs.Sent.hold`, which `resume` names; None if the vehicle does not hold."""
     armed: bool | None = None
     mode: str | None = None
     landed: str | None = None

@@ -39,8 +39,8 @@ from companion.ground.station.station import Station
 from companion.ground.station.web_guard import (
     HEADERS,
     MESSAGE_MAX_BYTES,
+    MESSAGES_BURST,
     MESSAGES_PER_S,
-    RateLimiter,
     host_allowed,
     is_loopback,
     new_token,
@@ -50,6 +50,7 @@ from companion.ground.station.web_guard import (
 from companion.model.commands import COMMANDS
 from companion.model.types import OperatorCommand
 from companion.runtime.tasks import until_first
+from companion.runtime.token_bucket import TokenBucket
 
 PAGE = Path(__file__).parent / "page"
 TOKEN_WAIT_S = 1.0
@@ -284,7 +285,7 @@ class _Session:
         self._ws = ws
         self._monitor = monitor
         self._token: object = None
-        self._bucket = RateLimiter(time.monotonic())
+        self._bucket = TokenBucket(MESSAGES_PER_S, MESSAGES_BURST)
 
     async def run(self) -> CloseReason:
         """Run until either side ends the connection; return the reason for the close frame."""

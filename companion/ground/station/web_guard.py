@@ -28,7 +28,7 @@ HEADERS = {
 """Headers of every response."""
 MESSAGE_MAX_BYTES = 1024
 """Largest message from a page."""
-MESSAGES_PER_S, MESSAGES_BURST = 10.0, 20.0
+MESSAGES_PER_S, MESSAGES_BURST = 10.0, 20
 _HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
 
 
@@ -79,21 +79,6 @@ def origin_allowed(origin: str | None, host_header: str | None, *, tls: bool) ->
     except ValueError:
         return False
     return (parts.scheme, parts.netloc.lower()) == ("https" if tls else "http", host_header.lower())
-
-
-class RateLimiter:
-    """Limits messages to `MESSAGES_PER_S` on average and `MESSAGES_BURST` at once."""
-
-    def __init__(self, now_s: float) -> None:
-        self._full_s = now_s
-
-    def take(self, now_s: float) -> bool:
-        """Count one message; return False if there are too many."""
-        full_s = max(self._full_s, now_s) + 1.0 / MESSAGES_PER_S
-        if full_s - now_s > MESSAGES_BURST / MESSAGES_PER_S + 1e-6:
-            return False
-        self._full_s = full_s
-        return True
 
 
 def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

@@ -10,7 +10,8 @@ from companion.ground.protocol.messages import DeviceHealth, HealthLevel
 from companion.model.estimator import EstimatorReport
 from companion.model.frames import wrap_rad, yaw_from_quat
 from companion.model.listing import listed
-from companion.model.types import ActiveRule, Inputs, Outputs, PhaseKind, SafetyAction
+from companion.model.outputs import ActiveRule, Outputs
+from companion.model.types import Inputs, PhaseKind, SafetyAction
 from companion.safety.rule import Lamp
 from companion.safety.rules import RULES
 

@@ -31,20 +31,11 @@ from companion.ground.protocol.strict_json import NUMBER_MAX
 from companion.ground.telemetry.health import HealthEvaluator, Snapshot, WorstAges
 from companion.ground.telemetry.timings import WorstTimings, merge_timings
 from companion.model.constants import GRADED_POSE_MAX_AGE_S, TICK_PERIOD_S
+from companion.model.contact import ContactState
 from companion.model.flight_stage import Stage
 from companion.model.markers import BallState
-from companion.model.types import (
-    ContactState,
-    ControlLog,
-    Inputs,
-    Outputs,
-    Quat,
-    Reference,
-    SafetyAction,
-    Sent,
-    TetherState,
-    Vec3,
-)
+from companion.model.outputs import ControlLog, Outputs, Sent, TetherState
+from companion.model.types import Inputs, Quat, Reference, SafetyAction, Vec3
 
 STREAM_PERIOD_S = 0.05
 """Period of the stream messages over MQTT, and of those of a replayed flight."""

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from companion.ground.protocol.messages import Timing
+from companion.model.outputs import Sent
 from companion.model.tick_times import TickTimes
-from companion.model.types import Inputs, Sent
+from companion.model.types import Inputs
 
 
 class WorstTimings:

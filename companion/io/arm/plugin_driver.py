@@ -59,11 +59,8 @@ class PluginArm(ThreadedArm[tuple[MotorState, ...], Joints]):
 
     def _open_bus(self) -> None:
         try:
-            found = device_class(ARMS, self._device.type)
+            found = device_class(ARMS, self._device.type, METHODS)
             plugin = find(ARMS, self._device.type)
-            missing = [name for name in METHODS if not callable(getattr(found, name, None))]
-            if missing:
-                raise plugin.error(f"its class has no method {missing[0]}()")
             self._where = str(plugin)
             try:
                 self._motors = found(found.options.model_validate(self._device.options), self._device, self._joints)

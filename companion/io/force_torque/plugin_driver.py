@@ -85,11 +85,8 @@ class PluginForceTorque(SampleStream):
 
     def _open(self) -> DeviceError | None:
         try:
-            found = device_class(FORCE_SENSORS, self._device.type)
+            found = device_class(FORCE_SENSORS, self._device.type, METHODS)
             plugin = find(FORCE_SENSORS, self._device.type)
-            missing = [name for name in METHODS if not callable(getattr(found, name, None))]
-            if missing:
-                raise plugin.error(f"its class has no method {missing[0]}()")
         except PluginError as error:
             return DeviceError(str(error))
         try:

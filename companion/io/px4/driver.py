@@ -1,7 +1,7 @@
 """Driver of PX4: MAVSDK's native binding on a link that the driver itself reads and writes.
 
 MAVSDK makes JSON of every message and calls Python from its own threads, which costs more than all else that a tick does with PX4. So
-the link is the driver's (`companion.io.px4.wire`): once per tick it reads what has arrived, decodes what the flight uses, and passes
+the link is the driver's (`companion.io.px4.traffic`): once per tick it reads what has arrived, decodes what the flight uses, and passes
 everything but the streams of the vehicle's state to MAVSDK, whose `raw://` connection returns what is to be sent. Setpoints, poses and
 commands are written straight onto the link. Decision 14 (docs/internals/decisions) gives the figures.
 """
@@ -9,10 +9,8 @@ commands are written straight onto the link. Decision 14 (docs/internals/decisio
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import math
-import socket
 from collections.abc import Callable, Iterable
 from typing import Any, Self
 
@@ -22,7 +20,7 @@ from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4 import messages
 from companion.io.px4.exclusive_link import ExclusiveLink
-from companion.io.px4.frames import FrameReader, FrameWriter, frames
+from companion.io.px4.frames import frames
 from companion.io.px4.inbox import Inbox
 from companion.io.px4.link import check_address, device_error, first_autopilot, open_link, quiet_native_log
 from companion.io.px4.origin import ensure_origin
@@ -31,8 +29,7 @@ from companion.io.px4.questions import Questions
 from companion.io.px4.requests import RequestQueue
 from companion.io.px4.setpoints import SetpointPath, setpoint_path
 from companion.io.px4.streams import ESTIMATOR_RATE_HZ, HEARTBEAT_ASK_PERIOD_S, ask_for_streams, stop_unread_streams
-from companion.io.px4.wire import OpenWire, UdpWire, open_wire
-from companion.io.reopening import Reopening
+from companion.io.px4.traffic import Traffic
 from companion.model.estimator import EstimatorReport
 from companion.model.observations import StateCounts
 from companion.model.types import (
@@ -49,9 +46,6 @@ _HEARTBEAT_DEADLINE_S = 5.0
 """Deadline for PX4's heartbeat, which is sent once per second."""
 _PUMP_S, _PUMP_IN_FLIGHT_S = 0.005, 0.05
 """Period at which the link is read while the flight loop does not read it, as at start-up, and at which that is checked otherwise."""
-_RELAY_DATAGRAMS_MAX = 16
-_DATAGRAM_MAX_BYTES = 65535
-
 _log = logging.getLogger(__name__)
 
 
@@ -83,18 +77,10 @@ class MavsdkAutopilot:
         self._inbox = Inbox(self._requests, self._after_heartbeat)
         self._mavsdk: Any = None
         self._connection: Any = None
-        self._wire: OpenWire | None = None
-        self._reopening: Reopening[OpenWire] | None = None
-        """Attempts to open a lost link again; None while it is open."""
-        self._asks_again = False
-        """Whether the streams must be requested again at the next HEARTBEAT, because the link was lost."""
+        self._traffic: Traffic | None = None
         self._asking: asyncio.Task[None] | None = None
-        self._reader = FrameReader(stream=False)
-        self._writer = FrameWriter(0, 0)
-        self._readers = self._inbox.readers
-        self._relay: socket.socket | None = None
         self._pump_timer: asyncio.TimerHandle | None = None
-        self._polled_s = self._asked_s = -math.inf
+        self._asked_s = -math.inf
         self._restore_log: Callable[[], None] | None = None
         self._setpoints: SetpointPath | None = None
         self._questions: Questions | None = None
@@ -123,15 +109,16 @@ class MavsdkAutopilot:
             self._mavsdk.subscribe_raw_bytes_to_be_sent(self._send_for_mavsdk)
             self._claim = claim = ExclusiveLink(address)
             await claim.find_px4(self._device.discovery_timeout_s)
-            self._writer = FrameWriter(*self._own_ids)
-            self._reader = FrameReader(stream=claim.peer is None)
-            self._wire = await asyncio.to_thread(open_link, address, claim.peer, self._clock, self._reports.append)
+            wire = await asyncio.to_thread(open_link, address, claim.peer, self._clock, self._reports.append)
+            self._traffic = traffic = Traffic(
+                address, wire, self._own_ids, stream=claim.peer is None, clock=self._clock, inbox=self._inbox,
+                to_mavsdk=self._mavsdk.pass_received_raw_bytes, reports=self._reports,
+            )  # fmt: skip
             self._pump()
             async with claim.calling(self._own_ids):
                 system = await first_autopilot(self._mavsdk, address, self._device.discovery_timeout_s)
             self._system_id = int(system.get_system_id())
-            if isinstance(self._wire, UdpWire):
-                self._wire.system = self._system_id
+            traffic.only_from(self._system_id)
             path = self._device.setpoint_path
             self._setpoints = setpoint_path(path, system, self._send_message, self._send_frame)
             self._questions = questions = Questions(address, self._system_id, self._inbox, self._send_message)
@@ -152,13 +139,13 @@ class MavsdkAutopilot:
 
     def identity(self) -> LinkIdentity:
         """Return the ids of both ends of the open link."""
-        wire, (own_system, own_component) = self._wire, self._own_ids
+        traffic, (own_system, own_component) = self._traffic, self._own_ids
         return LinkIdentity(
             autopilot_system=self._system_id,
             own_system=own_system,
             own_component=own_component,
-            local_port=wire.local_port if wire is not None else 0,
-            peer=wire.remote if wire is not None else None,
+            local_port=traffic.local_port if traffic is not None else 0,
+            peer=traffic.remote if traffic is not None else None,
         )
 
     def forward_to(self, port: int) -> int:
@@ -166,11 +153,8 @@ class MavsdkAutopilot:
         port from which it is sent; datagrams of all other senders are ignored.
         """
         self._require_open()
-        self._relay = relay = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        relay.setblocking(False)
-        relay.bind(("127.0.0.1", 0))
-        relay.connect(("127.0.0.1", port))
-        return int(relay.getsockname()[1])
+        assert self._traffic is not None
+        return self._traffic.forward_to(port)
 
     def vehicle(self) -> VehicleState | None:
         """Read the link, then return the latest fused state, or None before position, attitude, rates and IMU have all arrived. Stamps
@@ -314,8 +298,13 @@ class MavsdkAutopilot:
             raise device_error(self._device.address, "an open link", "a closed one", fix)
 
     def _after_heartbeat(self) -> None:
-        if self._asks_again and self._questions is not None and self._loop is not None:
-            self._asks_again = False
+        if (
+            self._traffic is not None
+            and self._traffic.was_lost
+            and self._questions is not None
+            and self._loop is not None
+        ):
+            self._traffic.was_lost = False
             self._asking = self._loop.create_task(self._ask_again(self._questions))
         self._show_ground_station()
 
@@ -325,18 +314,6 @@ class MavsdkAutopilot:
             await ask_for_streams(questions, self._estimator_rate_hz)
         except DeviceError as error:
             self._reports.append(str(error))
-
-    def _restore_link(self) -> None:
-        """Close a lost link, and use it again once it is open again."""
-        address, wire = self._device.address, self._wire
-        if self._reopening is None:
-            assert wire is not None
-            wire.close()
-            self._reports.append(f"autopilot {address}: the connection has ended; trying again")
-            self._reopening = Reopening("px4 reopening", lambda: open_wire(address, clock=self._clock))
-        elif (again := self._reopening.take()) is not None:
-            self._reopening, self._wire, self._asks_again = None, again, True
-            self._reports.append(f"autopilot {address}: the connection is open again")
 
     def _show_ground_station(self) -> None:
         """Answer the heartbeat of a disarmed PX4 with that of a ground station, because PX4 reports the
@@ -362,55 +339,20 @@ class MavsdkAutopilot:
     def _pump(self) -> None:
         """Read the link regularly while the flight loop does not."""
         assert self._loop is not None
-        idle = self._clock() - self._polled_s > 1.5 * _PUMP_S
+        idle = self._traffic is not None and self._clock() - self._traffic.polled_s > 1.5 * _PUMP_S
         if idle:
             self._poll()
         self._pump_timer = self._loop.call_later(_PUMP_S if idle else _PUMP_IN_FLIGHT_S, self._pump)
 
     def _poll(self) -> None:
-        """Read what has arrived: decode what the flight uses, and pass everything but the vehicle's state to MAVSDK."""
-        self._polled_s = self._clock()
-        if self._wire is None:
-            return
-        if self._wire.lost:
-            self._restore_link()
-            return
-        others: list[bytes] = []
-        for arrived_s, data in self._wire.receive():
-            forwarded: list[bytes] = []
-            for message_id, system, component, payload, frame in self._reader.read(data):
-                forwarded.append(frame)
-                # A gimbal or camera with the same system id has a heartbeat of its own.
-                px4 = system == self._system_id and component == messages.MAV_COMP_ID_AUTOPILOT1
-                read = self._readers.get(message_id) if px4 else None
-                if read is not None:
-                    read(arrived_s, payload)
-                    continue
-                others.append(frame)
-                if px4:
-                    self._inbox.take(arrived_s, message_id, frame)
-            if self._relay is not None and forwarded:
-                with contextlib.suppress(OSError):  # the relay does not keep up or has ended: lost, as on any link
-                    self._relay.send(b"".join(forwarded))
-        if others:
-            self._mavsdk.pass_received_raw_bytes(b"".join(others))
-        if self._relay is not None:
-            self._send_for_relay(self._relay)
-
-    def _send_for_relay(self, relay: socket.socket) -> None:
-        assert self._wire is not None
-        for _ in range(_RELAY_DATAGRAMS_MAX):
-            try:
-                self._wire.send(relay.recv(_DATAGRAM_MAX_BYTES))
-            except OSError:  # nothing more, or an ICMP error of an earlier send
-                return
+        if self._traffic is not None:
+            self._traffic.poll()
 
     def _send_message(self, message_id: int, payload: bytes) -> bool:
-        return self._wire is not None and self._wire.send(self._writer.frame(message_id, payload))
+        return self._traffic is not None and self._traffic.send_message(message_id, payload)
 
     def _send_frame(self, frame: bytes) -> bool:
-        wire = self._wire
-        return wire is not None and wire.send(self._writer.numbered(frame))
+        return self._traffic is not None and self._traffic.send_frame(frame)
 
     def _send_for_mavsdk(self, data: bytes, *_: Any) -> None:
         """Send what MAVSDK sends, in a thread of MAVSDK; setpoints only as their path wants."""
@@ -425,10 +367,9 @@ class MavsdkAutopilot:
         self._open = False
         if self._pump_timer is not None:
             self._pump_timer.cancel()
-        wire, self._wire = self._wire, None
         if self._asking is not None:
             self._asking.cancel()
-        for held in (wire, self._reopening, self._relay, self._claim):  # from here on nothing can leave
+        for held in (self._traffic, self._claim):  # from here on nothing can leave
             if held is not None:
                 held.close()
         if self._connection is not None:
@@ -446,6 +387,3 @@ class MavsdkAutopilot:
         finally:
             if self._restore_log is not None:
                 self._restore_log()
-
-
-__all__ = ["DeviceError", "MavsdkAutopilot"]

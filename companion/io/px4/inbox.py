@@ -53,7 +53,12 @@ class Inbox:
             mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._on_estimator,
             mavlink.MAVLINK_MSG_ID_STATUSTEXT: self._on_status_text,
         }
-
+        self.readers: dict[int, Callable[[float, bytes], None]] = {
+            messages.LOCAL_POSITION_NED_ID: self._on_position,
+            messages.ATTITUDE_QUATERNION_ID: self._on_attitude,
+            messages.HIGHRES_IMU_ID: self._on_imu,
+        }
+        """What stores each stream of the vehicle's state, by message id; called with arrival and payload of PX4's message."""
         self._vehicle_key: tuple[Any, ...] | None = None
         self._vehicle: VehicleState | None = None
 
@@ -141,17 +146,6 @@ class Inbox:
     def counts(self) -> StateCounts:
         """Return the number of state messages since the link was opened."""
         return StateCounts(self._positions, self._attitudes, self._imus)
-
-    @property
-    def readers(self) -> dict[int, Callable[[float, bytes], None]]:
-        """Return what stores each stream of the vehicle's state, by message id; to be called with arrival and payload of a message of
-        the autopilot.
-        """
-        return {
-            messages.LOCAL_POSITION_NED_ID: self._on_position,
-            messages.ATTITUDE_QUATERNION_ID: self._on_attitude,
-            messages.HIGHRES_IMU_ID: self._on_imu,
-        }
 
     def _on_position(self, stamp_s: float, payload: bytes) -> None:
         self._position = (stamp_s, *messages.local_position_ned(payload))

@@ -10,8 +10,9 @@ from companion.io.protocols import DeviceError
 from companion.model.types import AutopilotStatus
 from companion.px4.defaults import PX4_DEFAULTS
 from companion.px4.params_file import Value, same
-from companion.px4.required import BY_NAME, NO_VEHICLE
+from companion.px4.required import BY_NAME
 from companion.px4.versions import varies
+from companion.px4.wanted import NO_VEHICLE
 
 
 class ParamLink(Protocol):

@@ -19,7 +19,8 @@ from typing import Any, Protocol, Self
 from companion.io.protocols import DeviceError
 from companion.io.qgroundcontrol import texts as words
 from companion.io.qgroundcontrol.channel import pack, unpack
-from companion.model.types import AutopilotRequest, Inputs, LinkIdentity, Outputs
+from companion.model.outputs import Outputs
+from companion.model.types import AutopilotRequest, Inputs, LinkIdentity
 
 VALUES_EVERY = 50
 """Number of ticks between two sets of values: 4 Hz at a control rate of 200 Hz."""

@@ -12,8 +12,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.io.qgroundcontrol.token_bucket import TokenBucket
-from companion.model.types import Event, Inputs, Outcome, Outputs, SafetyAction, Severity
+from companion.model.outputs import Outputs
+from companion.model.types import Event, Inputs, Outcome, SafetyAction, Severity
+from companion.runtime.token_bucket import TokenBucket
 
 COMPONENT = int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
 TEXT_BYTES = 50
@@ -25,7 +26,7 @@ TEXTS_WAITING_MAX = 20
 VALUE_NAMES = ("slack_m", "stop_slk_m", "e_p_m", "e_q_deg", "rho", "payload_kg", "progress")
 """Values of NAMED_VALUE_FLOAT.name, 10 characters at most."""
 
-_EMERGENCY, _CRITICAL, _WARNING, _NOTICE, _INFO = 0, 2, 4, 5, 6
+_CRITICAL, _WARNING, _NOTICE, _INFO = 2, 4, 5, 6
 _SEVERITIES = {Severity.INFO: _INFO, Severity.WARNING: _WARNING, Severity.CRITICAL: _CRITICAL}
 _OUTCOMES = {Outcome.COMPLETED: _NOTICE, Outcome.REFUSED: _WARNING, Outcome.ABORTED: _WARNING}
 

@@ -17,7 +17,7 @@ from collections import Counter
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.px4.frames import REQUEST_EVENT, Frame, autopilot_heartbeat, frames
-from companion.io.qgroundcontrol.token_bucket import TokenBucket
+from companion.runtime.token_bucket import TokenBucket
 
 UP_RATE_HZ = 100.0
 UP_BURST = 100

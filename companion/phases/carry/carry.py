@@ -39,7 +39,7 @@ BAR_LOST = EventDefinition(
 )  # fmt: skip
 STAND_S: Final = 0.5
 """Time at the end of the way after which the bar stands."""
-SET_DOWN_M: Final = 0.01
+SET_DOWN_M: Final = 0.03
 """Depth by which the handles are led below the height at which the bar stands, so that it does stand."""
 WAIT_MAX_S: Final = 5.0
 """Longest wait for the other vehicle at the end of the way."""

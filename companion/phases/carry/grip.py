@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, ClassVar, Final, Literal
 
 from msgspec.structs import replace
@@ -13,6 +13,7 @@ from companion.config.arm import JAWS_TOLERANCE_DEG, Jaws
 from companion.config.phase import ArmPose, Duration, PhaseSettings
 from companion.control.arm_model import manipulator_of
 from companion.mission.air import Air, Expectation, HeldBar
+from companion.mission.bar_landing import BACK_M, RISE_M
 from companion.mission.minsnap import least_line_s
 from companion.mission.phase import Checking, Phase, Planning
 from companion.model.algebra import minus, plus, scaled
@@ -20,12 +21,26 @@ from companion.model.codec import Record
 from companion.model.frames import quat_rotate
 from companion.model.team import ClampCommand, Grip
 from companion.model.types import Inputs, Reference, SafetyAction, Severity, Vec3
-from companion.phases.carry.bar import Bar, BarPose, End, body_in_bar_m, body_m, problems_of, sign_of, vehicle_yaw_rad
+from companion.phases.carry.bar import (
+    Bar,
+    BarPose,
+    End,
+    body_in_bar_m,
+    body_m,
+    problems_of,
+    sign_of,
+    turned_about_z,
+    vehicle_yaw_rad,
+)
 from companion.safety.notices import EventDefinition
 
 GRIPPED = EventDefinition(
     "gripped", Severity.INFO, SafetyAction.NOMINAL, "the clamp has closed around the bar's handle"
 )
+GRIPPED_NOTHING = EventDefinition(
+    "gripped_nothing", Severity.WARNING, SafetyAction.NOMINAL,
+    "the jaws have closed beside the handle: they open, and the clamp is led to a place 4 cm beside where it was",
+)  # fmt: skip
 NOT_GRIPPED = EventDefinition(
     "not_gripped", Severity.CRITICAL, SafetyAction.LAND,
     "the clamp did not reach the handle or did not close, or the other vehicle was not ready in time: the vehicle lets go and lands",
@@ -44,6 +59,8 @@ class Gripping(Record, frozen=True, kw_only=True):
 
     at_handle_s: float = math.inf
     """Flight clock since which the clamp has been at the handle; infinite while it is not."""
+    over_bar: bool = False
+    """Whether a landing must first move away from the bar."""
     waits_since_s: float = math.inf
     """Flight clock at the end of the way to the handle."""
     handle_m: Vec3 = (0.0, 0.0, 0.0)
@@ -53,6 +70,10 @@ class Gripping(Record, frozen=True, kw_only=True):
     offset_m: Vec3 = (0.0, 0.0, 0.0)
     """Offset of the reference: to where the handle is, and from the grip on to where the vehicle is held."""
     closes: bool = False
+    misses: int = 0
+    """How often the jaws have closed beside the handle."""
+    stopped_s: float = math.inf
+    """Flight clock since which the jaws have been closed as far as around a handle; infinite while they are not."""
     closed_s: float = math.inf
     """Flight clock at which the clamp had closed."""
     lift_server_s: float | None = None
@@ -73,9 +94,9 @@ class GripHandle(Phase):
     """Height of the clamp above the handle before it is lowered."""
     lower_s: Duration = 2.0
     """Duration of the lowering."""
-    tolerance_m: Annotated[float, Field(ge=0.005, le=0.05)] = 0.015
+    tolerance_m: Annotated[float, Field(ge=0.005, le=0.05)] = 0.02
     """Distance of the clamp from the handle up to which it closes: the jaws are wider than the handle by this much."""
-    wait_max_s: Duration = 30.0
+    wait_max_s: Duration = 45.0
     """Longest time at the handle until both vehicles are ready."""
     let_go_height_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
     """Height of the bar's feet above the floor below which an emergency may let go of it."""
@@ -141,14 +162,21 @@ class GripHandle(Phase):
                 self.pose(self.bar.handle_height_m),
                 body_in_bar_m(air.manipulator, self.end, self.bar, self.arm_rad()),
             )
-            if math.dist(air.plan_reference().position_world_m, end_m) < ARRIVED_M:
-                s = replace(s, waits_since_s=air.t_s)
+            left_m = math.dist(air.plan_reference().position_world_m, end_m)
+            s = replace(s, over_bar=left_m < OVER_BAR_M, waits_since_s=air.t_s if left_m < ARRIVED_M else math.inf)
         if s.waits_since_s == math.inf:
             return s
         if not s.closes:
             s = replace(s, at_handle_s=self._at_handle_since_s(air, s))
-            s = replace(s, closes=air.nominal and air.t_s - s.at_handle_s >= SETTLE_S)
-        elif s.closed_s == math.inf and is_at(air.i, air.vehicle.jaws, ClampCommand.CLOSE):
+            ready = air.nominal and air.t_s - s.at_handle_s >= SETTLE_S
+            s = replace(s, closes=ready and self._is_near(air, s) and is_at(air.i, air.vehicle.jaws, ClampCommand.OPEN))
+        elif s.closed_s == math.inf and is_empty(air.i, air.vehicle.jaws):
+            air.report(GRIPPED_NOTHING, f"the jaws have closed beside the {self.end} handle; trying again beside it")
+            s = replace(s, closes=False, misses=s.misses + 1, at_handle_s=math.inf, stopped_s=math.inf)
+        elif s.closed_s == math.inf:
+            stops = is_at(air.i, air.vehicle.jaws, ClampCommand.CLOSE)
+            s = replace(s, stopped_s=min(s.stopped_s, air.t_s) if stops else math.inf)
+        if s.closed_s == math.inf and air.t_s - s.stopped_s >= STOPPED_S:
             s = replace(s, closed_s=air.t_s)
             air.report(GRIPPED, f"the {self.end} end of the bar is gripped")
         if (lift_s := self._lift_server_s(air, s)) is not None:
@@ -177,7 +205,11 @@ class GripHandle(Phase):
             grip=Grip.READY if s.closed_s < math.inf else Grip.FREE,
             lift_server_s=s.lift_server_s if self.end == "left" else None,
             bar=self.held() if s.closes else None,
+            back_m=self._back_m() if s.over_bar else None,
         )
+
+    def _back_m(self) -> Vec3:
+        return turned_about_z((-BACK_M, 0.0, RISE_M), vehicle_yaw_rad(math.radians(self.bar.yaw_deg), self.end))
 
     def held(self) -> HeldBar:
         """Return what a landing must know of the bar."""
@@ -186,6 +218,16 @@ class GripHandle(Phase):
 
     def _at_handle_since_s(self, air: Air, s: Gripping) -> float:
         return math.inf if math.hypot(*s.beside_m) > self.tolerance_m else min(s.at_handle_s, air.t_s)
+
+    def _is_near(self, air: Air, s: Gripping) -> bool:
+        tip = air.tip_world_m()
+        return tip is not None and math.dist(tip, self._seen_m(s)) <= self.tolerance_m
+
+    def _seen_m(self, s: Gripping) -> Vec3:
+        """Return where the handle is, or is searched after the jaws have missed it."""
+        yaw_rad = vehicle_yaw_rad(math.radians(self.bar.yaw_deg), self.end)
+        beside = turned_about_z(SEARCH_M[s.misses % len(SEARCH_M)], yaw_rad)
+        return plus(plus(self._handle_m(), s.handle_m), beside)
 
     def _half(self) -> Vec3:
         return (sign_of(self.end) * 0.5 * self.bar.length_m, 0.0, 0.0)
@@ -204,7 +246,7 @@ class GripHandle(Phase):
         elif tip is None:
             return s
         else:
-            beside = minus(tip, plus(self._handle_m(), s.handle_m))
+            beside = minus(tip, self._seen_m(s))
             s = replace(s, beside_m=beside if s.beside_m[0] == math.inf else toward(s.beside_m, beside, share))
             offset = minus(s.offset_m, scaled(s.beside_m, air.dt_s / LEAD_S))
         return s if math.hypot(*offset) > BESIDE_MAX_M else replace(s, offset_m=offset)
@@ -241,14 +283,32 @@ SEEN_S: Final = 0.2
 """Age up to which a pose of the bar counts."""
 SEE_S: Final = 0.5
 """Time constant of the low-passes of what is seen."""
-LEAD_S: Final = 1.5
-"""Time constant with which the clamp is led to the handle."""
+LEAD_S: Final = 5.0
+"""Time constant with which the clamp is led to the handle: slower than the integral action of the control laws."""
 YIELD_S: Final = 1.0
 """Time constant with which the reference of a gripping vehicle moves to where it is."""
 BESIDE_MAX_M: Final = 0.1
 """Largest offset; a bar further from its place in the mission is not gripped."""
+OVER_BAR_M: Final = 0.4
+"""Distance from the handle below which the rotors may be above the bar."""
+STOPPED_S: Final = 0.3
+"""Time for which the handle must stop the jaws."""
+SEARCH_M: Final[Sequence[Vec3]] = (
+    (0.0, 0.0, 0.0), (0.04, 0.0, 0.0), (-0.04, 0.0, 0.0), (0.0, 0.04, 0.0), (0.0, -0.04, 0.0)
+)  # fmt: skip
+"""Places beside the handle, forward and left of the vehicle, at which it is searched one after the other."""
 APART_M: Final = 0.3
 """Least distance between the rotor circles of the two vehicles."""
+
+
+def is_empty(i: Inputs, jaws: Jaws | None) -> bool:
+    """Return whether the jaws have closed further than a handle between them allows."""
+    if jaws is None or i.clamp is None:
+        return False
+    beyond_deg = (math.degrees(i.clamp.angle_rad) - jaws.closed_deg) * math.copysign(
+        1.0, jaws.closed_deg - jaws.open_deg
+    )
+    return beyond_deg > JAWS_TOLERANCE_DEG
 
 
 def toward(value: Vec3, goal: Vec3, share: float) -> Vec3:

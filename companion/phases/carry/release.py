@@ -10,12 +10,14 @@ from pydantic import Field
 
 from companion.config.phase import ArmPose, Duration, PhaseSettings
 from companion.mission.air import Air, Expectation
+from companion.mission.bar_landing import BACK_M, RISE_M
 from companion.mission.phase import Phase, Planning
 from companion.model.codec import Record
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.team import ClampCommand, Grip
-from companion.model.types import SafetyAction, Severity
-from companion.phases.carry.grip import is_at
+from companion.model.types import SafetyAction, Severity, Vec3
+from companion.phases.carry.bar import turned_about_z
+from companion.phases.carry.grip import OVER_BAR_M, is_at
 from companion.safety.notices import EventDefinition
 
 RELEASED = EventDefinition("released", Severity.INFO, SafetyAction.NOMINAL, "the clamp has opened and let the bar go")
@@ -33,6 +35,12 @@ class Releasing(Record, frozen=True, kw_only=True):
     """State of the phase."""
 
     begun_s: float
+    begun_m: Vec3
+    """Planned position of the vehicle then, world frame."""
+    back_m: Vec3
+    """Way backwards and up, away from the bar."""
+    over_bar: bool = True
+    """Whether a landing must first move away from the bar."""
     open: bool = False
     told: bool = False
 
@@ -69,13 +77,16 @@ class Release(Phase):
 
     def begin(self, air: Air) -> Releasing:
         """Return the state at the start."""
-        return Releasing(begun_s=air.t_s)
+        back_m = turned_about_z((-BACK_M, 0.0, RISE_M), air.plan_reference().yaw_rad)
+        return Releasing(begun_s=air.t_s, begun_m=air.plan_reference().position_world_m, back_m=back_m)
 
     def step(self, air: Air, own: Any) -> Releasing | None:
         """Return the state after one tick; None at the end."""
         s: Releasing = own
         if s.open:
-            return None if air.segment.index != air.engaged.index else s
+            if air.segment.index != air.engaged.index:
+                return None
+            return replace(s, over_bar=math.dist(air.plan_reference().position_world_m[:2], s.begun_m[:2]) < OVER_BAR_M)
         if is_at(air.i, air.vehicle.jaws, ClampCommand.OPEN):
             air.report(RELEASED, "the bar is let go")
             return replace(s, open=True)
@@ -90,4 +101,8 @@ class Release(Phase):
     def expects(self, own: Any) -> Expectation:
         """Return the clamp's command."""
         s: Releasing = own
-        return Expectation(clamp=ClampCommand.OPEN, grip=Grip.FREE if s.open else Grip.STANDING)
+        return Expectation(
+            clamp=ClampCommand.OPEN,
+            grip=Grip.FREE if s.open else Grip.STANDING,
+            back_m=s.back_m if s.over_bar else None,
+        )

@@ -13,7 +13,8 @@ from companion.config.base import Vector3, refuse
 from companion.config.phase import PhaseSettings
 from companion.mission.air import Air, Expectation
 from companion.mission.phase import Checking, Phase, Planning
-from companion.model.types import ContactState, Reference, Vec2
+from companion.model.contact import ContactState
+from companion.model.types import Reference, Vec2
 from companion.phases.contact import checks, force, machine, points
 from companion.phases.contact.way import Way, approach_s
 

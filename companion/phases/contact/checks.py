@@ -133,7 +133,7 @@ def _corners(reference: Reference, way: Way, ahead_m: float) -> Iterator[Vec3]:
         yield (x, y, z)
 
 
-def force_problems(vehicle: Vehicle, reference: Reference, direction: Vec3, force_n: float) -> Iterator[str]:
+def force_problems(vehicle: Vehicle, direction: Vec3, force_n: float) -> Iterator[str]:
     """Check the limit of the force, and the tilt with which the vehicle presses."""
     airframe, most_n = vehicle.airframe, FORCE_SHARE_MAX * vehicle.safety.contact_force_max_n
     if force_n > most_n:

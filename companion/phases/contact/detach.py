@@ -7,7 +7,7 @@ from typing import Literal
 from companion.config.phase import PhaseSettings
 from companion.mission.air import Air
 from companion.mission.phase import Planning
-from companion.model.types import ContactState
+from companion.model.contact import ContactState
 from companion.phases.contact import machine
 from companion.phases.contact.base import ContactPhase, ContactSpeed, Pressing, opening_of
 from companion.phases.contact.force import RELEASE_S

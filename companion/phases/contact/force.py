@@ -13,8 +13,9 @@ import math
 
 from msgspec.structs import replace
 
+from companion.model.contact import ContactMode, ContactShift, ContactState
 from companion.model.frames import wrap_rad
-from companion.model.types import ContactMode, ContactShift, ContactState, Joints, Reference, Vec3
+from companion.model.types import Joints, Reference, Vec3
 
 TARE_S = 1.0
 """Time at rest before the approach, in which the force without contact is averaged."""
@@ -320,12 +321,11 @@ def touches(contact: ContactState, touch_n: float) -> bool:
     return sensed_n(contact) > LOST_SHARE * touch_n
 
 
-def pressed(contact: ContactState, t_s: float, dt_s: float, touch_n: float, force_n: float) -> ContactState:
+def pressed(contact: ContactState, dt_s: float, touch_n: float, force_n: float) -> ContactState:
     """Return the state after one tick of pressing: the offset comes to rest and the force follows its ramp from the touch's.
 
     Args:
         contact: state in mode PRESS.
-        t_s: flight clock.
         dt_s: time since the last tick.
         touch_n: threshold of the touch, where the ramp begins.
         force_n: force at the ramp's end.

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from companion.config.vehicle import OBSERVER
 from companion.mission.air import Air
-from companion.model.types import ContactMode, ContactState
+from companion.model.contact import ContactMode, ContactState
 from companion.phases.contact import force as c
 from companion.phases.contact import points, sliding
 from companion.phases.contact.sliding import Stroke
@@ -108,7 +108,7 @@ def detached(air: Air, contact: ContactState) -> ContactState:
 def pressed(air: Air, contact: ContactState, way: Way, force_n: float) -> ContactState:
     """Return the state after one tick of a press."""
     rises = contact.wanted_n < force_n
-    contact = c.pressed(contact, air.t_s, air.dt_s, way.touch_n, force_n)
+    contact = c.pressed(contact, air.dt_s, way.touch_n, force_n)
     if rises and contact.wanted_n >= force_n:
         _warn_if_beside(air, contact)
     return _kept(air, contact, way)

@@ -13,7 +13,8 @@ from msgspec.structs import replace
 from companion.mission.air import Air
 from companion.model.algebra import dot
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import ContactMode, ContactState, FoundSurface, TouchedPoint, Vec3
+from companion.model.contact import ContactMode, ContactState, FoundSurface, TouchedPoint
+from companion.model.types import Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact.surface import TILT_MAX_RAD, axes, plane, tool_turn_rad, turn_to
 from companion.phases.contact.way import Way, back_from_point_m
@@ -39,7 +40,7 @@ def weighed(air: Air, contact: ContactState, way: Way) -> ContactState:
 def touching(air: Air, contact: ContactState, way: Way) -> ContactState:
     """Return the state after one tick at a point: the light force is held, and the tip's position averaged."""
     dt_s, t_s = air.dt_s, air.t_s
-    contact = c.pressed(contact, t_s, dt_s, way.touch_n, way.touch_n)
+    contact = c.pressed(contact, dt_s, way.touch_n, way.touch_n)
     felt = c.touches(contact, way.touch_n)
     contact = c.timed(contact, dt_s, not felt)
     if contact.beyond_s >= c.LOST_S:  # gusts have feigned a touch

@@ -8,7 +8,7 @@ from typing import Literal
 from companion.config.phase import Duration
 from companion.mission.air import Air
 from companion.mission.phase import Checking, Planning
-from companion.model.types import ContactState
+from companion.model.contact import ContactState
 from companion.phases.contact import checks, machine
 from companion.phases.contact.base import Pressing, opening_of
 from companion.phases.contact.force import PRESS_RAMP_S
@@ -33,7 +33,7 @@ class Press(Pressing):
     def problems(self, c: Checking) -> Iterator[str]:
         """Check the reserves for the force."""
         way = opening_of(c.earlier).way
-        yield from checks.force_problems(c.vehicle, c.begin, way.direction_world, self.force_n)
+        yield from checks.force_problems(c.vehicle, way.direction_world, self.force_n)
         yield from checks.torque_problems(c.vehicle, c.begin, way, self.force_n)
 
     def touching(self, air: Air, contact: ContactState, way: Way) -> ContactState:

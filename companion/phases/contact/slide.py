@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from companion.config.base import Vector2, refuse
 from companion.mission.air import Air, Expectation
 from companion.mission.phase import Checking, Planning
-from companion.model.types import ContactMode, ContactState
+from companion.model.contact import ContactMode, ContactState
 from companion.phases.contact import checks, machine
 from companion.phases.contact.base import ContactSpeed, Pressing, opening_of
 from companion.phases.contact.force import PRESS_RAMP_S
@@ -64,7 +64,7 @@ class Slide(Pressing):
         for phase in takewhile(lambda phase: phase is not opening, reversed(c.earlier)):
             if isinstance(phase, Slide):
                 right_m, up_m = right_m + phase.displacement_m[0], up_m + phase.displacement_m[1]
-        yield from checks.force_problems(c.vehicle, c.begin, opening.way.direction_world, self.force_n)
+        yield from checks.force_problems(c.vehicle, opening.way.direction_world, self.force_n)
         yield from checks.slide_problems(
             c.vehicle, c.mission.limits, c.begin, opening.way, self.stroke, (right_m, up_m)
         )

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from msgspec.structs import replace
 
 from companion.mission.air import Air
-from companion.model.types import ContactMode, ContactState, Vec2, Vec3
+from companion.model.contact import ContactMode, ContactState
+from companion.model.types import Vec2, Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact.points import ahead_m
 from companion.phases.contact.surface import axes
@@ -66,7 +67,7 @@ def begun(contact: ContactState, stroke: Stroke) -> ContactState:
 def slid(air: Air, contact: ContactState, stroke: Stroke, touch_n: float) -> ContactState:
     """Return the state after one tick of a slide."""
     dt_s = air.dt_s
-    contact = c.pressed(contact, air.t_s, dt_s, touch_n, stroke.force_n)
+    contact = c.pressed(contact, dt_s, touch_n, stroke.force_n)
     slides = contact.mode is ContactMode.SLIDE
     if not slides and contact.wanted_n != stroke.force_n:
         return contact

@@ -9,7 +9,8 @@ from typing import Final
 from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
 from companion.model.algebra import dot
-from companion.model.types import FoundSurface, Joints, Vec3
+from companion.model.contact import FoundSurface
+from companion.model.types import Joints, Vec3
 
 TILT_MAX_RAD = math.radians(30.0)
 """Largest angle between a surface's normal and the direction of the approach. Beyond it a touch is taken for a false one."""

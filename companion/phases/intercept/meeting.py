@@ -1,14 +1,8 @@
-"""Motion of the vehicle to a meeting point, and the choice of that point. Pure.
+"""The net's way to a meeting point, and the choice of that point. Pure.
 
 Towards a ball, the reference accelerates so that the net is at the meeting with the least integral of the acceleration's square, within
 its limit: a multiple of the net's response to an impulse of acceleration, clipped. The farther the ball, the more of it is clipped, up
-to full tilt in one direction and then in the other, which is as far as the net can come. Every tick ends in a state from which a stop
-respects every limit; otherwise the vehicle pushes less, brakes, or stops as it would have in the tick before.
-
-A stop is a quintic in each axis: the minimum-jerk segment from position, velocity and acceleration (Mueller, Hehn and D'Andrea, IEEE
-T-RO 31, 2015). Every limit is convex: the box, the safe set of the governor, also for the place where the vehicle would come to rest,
-the cone of the tilt, and the balls of speed, acceleration, thrust and jerk. A polynomial lies in the convex hull of its Bernstein
-coefficients, so a motion whose few coefficients respect the limits respects them at all times.
+to full tilt in one direction and then in the other, which is as far as the net can come.
 """
 
 from __future__ import annotations
@@ -20,21 +14,11 @@ import operator
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from companion.config.mission import Limits
-from companion.config.vehicle import Vehicle
 from companion.model.codec import Record
-from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Vec3
 from companion.phases.intercept.ball import Point
-from companion.safety.governor import SafeSet
-from companion.safety.stop import StopModel
+from companion.phases.intercept.motion import Bounds, State
 
-SHARE: Final = 0.98
-"""Fraction of the limits of speed, acceleration and jerk that is used: the governor compares differences between ticks with them."""
-TILT_RESERVE_RAD: Final = math.radians(2.0)
-"""Tilt that is left to the control law."""
-STOP_LEAST_S: Final = 0.5
-"""Shortest duration of a stop."""
 LAG_S: Final = 0.12
 """Time constant of each of the lags through which body and tilt follow the reference's acceleration."""
 BODY_S2 = (0.0, -0.051, 0.182, -0.421, 0.274)
@@ -61,84 +45,6 @@ STEP_S: Final = 0.02
 """Step of the sums over the time to a meeting."""
 TRIED_MAX: Final = 10
 """Number of meetings that are tried, those of the least effort first, until the ball clears the rotors."""
-PIECES: Final = 3
-"""Number of pieces of a motion that are compared with the limits: the coefficients of a short piece are close to the curve."""
-EASED = (1.0, 0.5, 0.0)
-"""Fractions of the wanted acceleration that are tried one after the other."""
-BRAKE_M_S2: Final = 2.0
-"""Deceleration that is tried after them."""
-
-
-class State(Record, frozen=True):
-    """Motion of the reference at one instant, world frame."""
-
-    position_m: Vec3
-    velocity_m_s: Vec3
-    acceleration_m_s2: Vec3
-    jerk_m_s3: Vec3 = (0.0, 0.0, 0.0)
-
-
-class Motion(Record, frozen=True):
-    """A quintic in each axis from a state; `alpha`, `beta` and `gamma` are snap's rate, snap and jerk at its start."""
-
-    start_s: float
-    duration_s: float
-    begin: State
-    alpha: Vec3
-    beta: Vec3
-    gamma: Vec3
-
-    @property
-    def end_s(self) -> float:
-        """Return the flight clock at the end."""
-        return self.start_s + self.duration_s
-
-    def at(self, t_s: float) -> State:
-        """Return the state at a time; after the end, that of the end."""
-        h, s = min(t_s, self.end_s) - self.start_s, self.begin
-        axes = zip(s.position_m, s.velocity_m_s, s.acceleration_m_s2, self.gamma, self.beta, self.alpha, strict=True)
-        (x, vx, ax, jx), (y, vy, ay, jy), (z, vz, az, jz) = [_axis(h, *axis) for axis in axes]
-        return State((x, y, z), (vx, vy, vz), (ax, ay, az), (jx, jy, jz))
-
-
-def _axis(
-    h: float, p: float, v: float, a: float, gamma: float, beta: float, alpha: float
-) -> tuple[float, float, float, float]:
-    return (
-        p + h * (v + h * (a / 2.0 + h * (gamma / 6.0 + h * (beta / 24.0 + h * alpha / 120.0)))),
-        v + h * (a + h * (gamma / 2.0 + h * (beta / 6.0 + h * alpha / 24.0))),
-        a + h * (gamma + h * (beta / 2.0 + h * alpha / 6.0)),
-        gamma + h * (beta + h * alpha / 2.0),
-    )
-
-
-def motion_to(t_s: float, begin: State, duration_s: float, position_m: Vec3 | None) -> Motion:
-    """Return the minimum-jerk motion to rest.
-
-    Args:
-        t_s: start on the flight clock.
-        begin: state at the start.
-        duration_s: duration.
-        position_m: position at the end; None if it is free.
-    """
-    h = duration_s
-    found = []
-    for k in range(3):
-        v0, a0 = begin.velocity_m_s[k], begin.acceleration_m_s2[k]
-        faster = -v0 - h * a0
-        if position_m is None:
-            found.append((0.0, (-12.0 * faster - 6.0 * h * a0) / h**3, (6.0 * faster + 2.0 * h * a0) / h**2))
-            continue
-        beyond = position_m[k] - begin.position_m[k] - h * (v0 + 0.5 * h * a0)
-        found.append(
-            (
-                (720.0 * beyond - 360.0 * h * faster - 60.0 * h * h * a0) / h**5,
-                (-360.0 * beyond + 168.0 * h * faster + 24.0 * h * h * a0) / h**4,
-                (60.0 * beyond - 24.0 * h * faster - 3.0 * h * h * a0) / h**3,
-            )
-        )
-    (ax, bx, gx), (ay, by, gy), (az, bz, gz) = found
-    return Motion(t_s, h, begin, (ax, ay, az), (bx, by, bz), (gx, gy, gz))
 
 
 class Lag(Record, frozen=True):
@@ -286,104 +192,6 @@ def _gain(responses: list[float], wanted_s2: float) -> float:
     return gain
 
 
-class Bounds:
-    """Limits of a motion; all are convex.
-
-    Args:
-        vehicle: thrust, tilt, mass and stopping distance.
-        limits: speed, acceleration, jerk and thrust limits of the mission.
-        safe: the governor's safe set.
-        home_m: centre of the box, world frame.
-        box_m: half sizes of the box in which the reference stays.
-    """
-
-    def __init__(self, vehicle: Vehicle, limits: Limits, safe: SafeSet, home_m: Vec3, box_m: Vec3) -> None:
-        airframe = vehicle.airframe
-        self._safe, self._stop, self._home_m, self._box_m = safe, StopModel(vehicle.safety), home_m, box_m
-        self.speed_m_s = SHARE * limits.speed_max_m_s
-        self.acceleration_m_s2 = SHARE * limits.acceleration_max_m_s2
-        self._jerk_m_s3 = SHARE * limits.jerk_max_m_s3
-        self._thrust_m_s2 = (
-            limits.thrust_share_max * airframe.thrust_max_n / (airframe.mass_kg + airframe.payload_max_kg)
-        )
-        self._slope = math.tan(math.radians(airframe.tilt_max_deg) - TILT_RESERVE_RAD)
-
-    def in_box(self, p: Vec3) -> bool:
-        """Return whether a position of the body's origin is in the box."""
-        (x, y, z), (hx, hy, hz), (bx, by, bz) = p, self._home_m, self._box_m
-        return abs(x - hx) <= bx and abs(y - hy) <= by and abs(z - hz) <= bz
-
-    def admit(self, m: Motion) -> bool:
-        """Return whether a motion respects every limit at all times, and leaves room to stop at all times."""
-        h = m.duration_s / PIECES
-        for k in range(PIECES):
-            begin, b, c = m.at(m.start_s + k * h), _plus(m.beta, m.alpha, k * h), m.alpha
-            if not self._admits_piece(Motion(m.start_s, h, begin, c, b, begin.jerk_m_s3)):
-                return False
-        return True
-
-    def _admits_piece(self, m: Motion) -> bool:
-        """Return whether the Bernstein coefficients of a motion respect every limit."""
-        h = m.duration_s
-        jerks = [m.gamma, _plus(m.gamma, m.beta, 0.5 * h), _plus(_plus(m.gamma, m.beta, h), m.alpha, 0.5 * h * h)]
-        pushes = _integrated(m.begin.acceleration_m_s2, jerks, h / 3.0)
-        if not all(math.hypot(*a) <= self.acceleration_m_s2 and self._can_push(a) for a in pushes):
-            return False
-        speeds = _integrated(m.begin.velocity_m_s, pushes, h / 4.0)
-        fastest = max([math.hypot(*v) for v in speeds])
-        if fastest > self.speed_m_s or not all(math.hypot(*j) <= self._jerk_m_s3 for j in jerks):
-            return False
-        places = _integrated(m.begin.position_m, speeds, h / 5.0)
-        # The velocity in the coefficients of degree 5.
-        raised = [_plus(_scaled(speeds[max(0, k - 1)], 0.2 * k), speeds[min(4, k)], 1.0 - 0.2 * k) for k in range(6)]
-        stop_s, safe = self._stop.time_s(fastest), self._safe
-        return all(
-            self.in_box(p) and safe.holds(p) and safe.holds(_plus(p, v, stop_s))
-            for p, v in zip(places, raised, strict=True)
-        )
-
-    def _can_push(self, a: Vec3) -> bool:
-        """Return whether tilt and thrust allow an acceleration."""
-        up = a[2] + GRAVITY_M_S2
-        return math.hypot(a[0], a[1]) <= self._slope * up and math.hypot(a[0], a[1], up) <= self._thrust_m_s2
-
-    def pushed(self, t_s: float, now: State, dt_s: float, push_m_s2: Vec3) -> State | None:
-        """Return the state a tick later with an acceleration as near to the wanted one as the limits allow; None if only the stop from
-        this state respects them.
-        """
-        speed_m_s = math.hypot(*now.velocity_m_s) or 1.0
-        tried = [_scaled(push_m_s2, share) for share in EASED] + [_scaled(now.velocity_m_s, -BRAKE_M_S2 / speed_m_s)]
-        for push in tried:
-            after = self._after(now, dt_s, self._within(push))
-            if self.admit(self.stop(t_s, after)):
-                return after
-        return None
-
-    def _within(self, a: Vec3) -> Vec3:
-        """Return the acceleration within the limits of size and tilt."""
-        a = _scaled(a, min(1.0, self.acceleration_m_s2 / max(1e-9, math.hypot(*a))))
-        aside = min(1.0, 0.999 * self._slope * (a[2] + GRAVITY_M_S2) / max(1e-9, math.hypot(a[0], a[1])))
-        return (aside * a[0], aside * a[1], a[2])
-
-    def _after(self, s: State, dt_s: float, push_m_s2: Vec3) -> State:
-        """Return the state after a tick whose constant jerk, within its limit, leads to an acceleration."""
-        j = _scaled(_plus(push_m_s2, s.acceleration_m_s2, -1.0), 1.0 / dt_s)
-        j = _scaled(j, min(1.0, self._jerk_m_s3 / max(1e-9, math.hypot(*j))))
-        v, a = s.velocity_m_s, s.acceleration_m_s2
-        return State(
-            _plus(_plus(_plus(s.position_m, v, dt_s), a, dt_s**2 / 2.0), j, dt_s**3 / 6.0),
-            _plus(_plus(v, a, dt_s), j, dt_s**2 / 2.0),
-            _plus(a, j, dt_s),
-            j,
-        )
-
-    def stop(self, t_s: float, begin: State) -> Motion:
-        """Return a stop whose acceleration is half of what the mission allows, or less."""
-        needed = max(math.hypot(*begin.velocity_m_s) * 1.5, math.hypot(*begin.acceleration_m_s2) * STOP_LEAST_S)
-        duration_s = max(STOP_LEAST_S, needed / (0.5 * self.acceleration_m_s2))
-        return motion_to(t_s, begin, duration_s, None)
-
-
 def meetings(
     t_s: float,
     now: State,
@@ -436,19 +244,3 @@ def meetings(
     found.sort(key=operator.itemgetter(0))
     for _, point, away_m in found[:TRIED_MAX]:
         yield reach.plan(point, point.t_s - t_s, away_m, most, (nx, ny))
-
-
-def _integrated(first: Vec3, rates: list[Vec3], h: float) -> list[Vec3]:
-    """Return the Bernstein coefficients of an integral from those of the integrand, with `h` the duration divided by the degree."""
-    sums = [first]
-    for rate in rates:
-        sums.append(_plus(sums[-1], rate, h))
-    return sums
-
-
-def _plus(a: Vec3, b: Vec3, k: float) -> Vec3:
-    return (a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2])
-
-
-def _scaled(a: Vec3, k: float) -> Vec3:
-    return (k * a[0], k * a[1], k * a[2])

@@ -14,27 +14,18 @@ from pydantic import Field
 from companion.config.base import NonNegative, Positive3
 from companion.config.phase import Duration
 from companion.control.arm_model import manipulator_of
-from companion.control.manipulator import Manipulator
 from companion.mission.air import Air, Expectation
 from companion.mission.phase import Checking, Phase, Planning
 from companion.model.codec import Record
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.markers import BallState
-from companion.model.types import ChaseState, Reference, SafetyAction, Severity, Vec3
+from companion.model.outputs import ChaseState
+from companion.model.types import Reference, SafetyAction, Severity, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate, Point
-from companion.phases.intercept.meeting import (
-    FROZEN_S,
-    Bounds,
-    Lag,
-    Motion,
-    Plan,
-    Reach,
-    State,
-    meetings,
-    motion_to,
-    reach_of,
-)
+from companion.phases.intercept.meeting import FROZEN_S, Lag, Plan, Reach, meetings, reach_of
+from companion.phases.intercept.motion import Bounds, Motion, State, motion_to
+from companion.phases.intercept.net import beside_m, net_m, opening
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 
@@ -44,15 +35,16 @@ STALE_S: Final = 0.3
 """Time without a frame after which no ball is known any more."""
 HORIZON_S: Final = 1.5
 """Longest time for which a ball's path is predicted."""
-BESIDE_S: Final = 0.5
-"""Time constant of the mean distance of the net from its reference, which is what the plan of a meeting adds to it."""
-BESIDE_MAX_M: Final = 0.1
 AMISS: Final = 0.5
 """Share of the net's deviation from the assumed response that is expected to be left at the meeting."""
 REST_S: Final = 1.0
 """Time at rest after a meeting, before the way back."""
 BACK_M_S: Final = 0.3
 """Largest speed of the way back."""
+FLOOR_M: Final = 0.1
+"""Smallest height of the net above the floor in the box."""
+TRACKING_M: Final = 0.1
+"""Distance from the limits of room and tether in the box."""
 BALL_M: Final = 0.05
 BALL_CHASED_M: Final = 0.045
 """Distance from the rotor disks at which a ball passes them, before and during a chase; it may be this large."""
@@ -245,7 +237,7 @@ class Intercept(Phase):
             if not s.seen:
                 air.report(NO_BALL, f"no ball within {self.wait_max_s:g} s; the plan goes on")
             return None
-        s = replace(s, beside_m=_beside(air, s))
+        s = replace(s, beside_m=beside_m(air, s.home, s.beside_m))
         balls = [candidate for candidate in s.candidates if candidate.is_ball]
         if not balls:
             if s.passing_m is not None and not s.at_rotors:
@@ -373,46 +365,6 @@ def _planned(s: Interception, plan: Plan, left_s: float) -> Interception:
     predicted_s, replans = (left_s, 0) if before is None else (before.predicted_s, before.replans + 1)
     chase = ChaseState(predicted_s=predicted_s, replans=replans, relative_speed_m_s=speed_m_s)
     return replace(s, plan=plan, chase=chase)
-
-
-FLOOR_M: Final = 0.1
-"""Smallest height of the net above the floor in the box."""
-TRACKING_M: Final = 0.1
-"""Distance from the limits of room and tether in the box."""
-
-
-def net_m(manipulator: Manipulator, reference: Reference) -> Vec3:
-    """Return the net's centre relative to the body's origin of the level vehicle, world frame."""
-    return quat_rotate(quat_from_euler_zyx(0.0, 0.0, reference.yaw_rad), manipulator.net_body_m(reference.arm_rad))
-
-
-def opening(manipulator: Manipulator, reference: Reference) -> Vec3:
-    """Return the unit vector out of the net's opening of the level vehicle, world frame: across the last link, upwards if that points
-    forwards.
-    """
-    (x, y, z), (jx, jy, jz) = (
-        manipulator.net_body_m(reference.arm_rad),
-        manipulator.joints_body_m(reference.arm_rad)[-1],
-    )
-    lx, ly, lz = x - jx, y - jy, z - jz
-    length = math.sqrt(lx * lx + ly * ly + lz * lz)
-    lx, ly, lz = lx / length, ly / length, lz / length
-    up = math.copysign(math.sqrt(max(1e-9, 1.0 - lz * lz)), lx)
-    return quat_rotate(quat_from_euler_zyx(0.0, 0.0, reference.yaw_rad), (-lz * lx / up, -lz * ly / up, up))
-
-
-def _beside(air: Air, s: Interception) -> Vec3:
-    """Return the mean position of the net minus that of its reference, after one more tick at rest."""
-    tip = air.tip_world_m()
-    if tip is None:
-        return s.beside_m
-    (px, py, pz), (x, y, z), share = s.home.position_world_m, net_m(air.manipulator, s.home), air.dt_s / BESIDE_S
-    found = [
-        before + share * (at - p - n - before)
-        for before, at, p, n in zip(s.beside_m, tip, (px, py, pz), (x, y, z), strict=True)
-    ]
-    bx, by, bz = (max(-BESIDE_MAX_M, min(BESIDE_MAX_M, value)) for value in found)
-    return (bx, by, bz)
 
 
 def _motion(r: Reference) -> tuple[Vec3, Vec3, Vec3]:

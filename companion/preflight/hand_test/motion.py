@@ -47,7 +47,6 @@ class GapError(ValueError):
 class Motion:
     """One motion from rest to rest."""
 
-    duration_s: float
     felt_m: Vec3
     """Displacement measured by the IMU, in the body frame at the start."""
     seen_m: Vec3
@@ -97,7 +96,6 @@ def measure(
         direction = scaled(felt, 1.0 / length)
         response = _response([dot(v, direction) for v in _detrended(felt_paces)], _detrended(paces))
     return Motion(
-        duration_s=end_s - start_s,
         felt_m=felt,
         seen_m=quat_rotate(back, seen_world),
         seen_world_m=seen_world,

@@ -84,9 +84,8 @@ class HandSample:
 class Stood:
     """State of the vehicle on the floor before it was lifted."""
 
-    position_m: Vec3
     attitude: Quat
-    """Position and attitude measured by motion capture."""
+    """Attitude measured by motion capture."""
     force_m_s2: Vec3
     rate_rad_s: Vec3
     """Specific force and rate measured by the IMU, body FLU; the rate is the gyro's bias."""
@@ -236,7 +235,6 @@ class HandTest:
         if rest is None or len(felt) < _POSES_MIN:
             return
         self._stood = Stood(
-            rest.position_m,
             rest.attitude,
             mean_vector([sample.force_m_s2 for sample in felt]),
             mean_vector([sample.rate_rad_s for sample in felt]),

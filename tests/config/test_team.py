@@ -1,0 +1,83 @@
+"""The team file: two configurations from one mission, and what is refused before anything moves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from companion.config.document import ConfigError
+from companion.mission.check import check_mission
+from companion.sitl_config.team import SEED_APART, TeamConfig, load_team
+
+CARRY = Path("configs/teams/carry.yaml")
+
+
+def problems(*overrides: str) -> list[str]:
+    with pytest.raises(ConfigError) as refused:
+        load_team(CARRY, overrides)
+    return list(refused.value.lines)
+
+
+def test_the_shipped_team_has_two_members_that_differ_where_they_must() -> None:
+    team = load_team("carry", ["world.seed=7"])
+    left, right = team.left, team.right
+    assert [config.mission.phases[1].model_dump()["end"] for _, config in team.members] == ["left", "right"]
+    assert left.mission.phases[2:] == right.mission.phases[2:]
+    assert (left.world.seed, right.world.seed) == (7, 7 + SEED_APART)
+    assert left.world.mass_error != right.world.mass_error
+    links = [config.vehicle.devices.team for _, config in team.members]
+    assert links[0] is not None
+    assert links[1] is not None
+    assert (links[0].port, links[0].partner_port) == (links[1].partner_port, links[1].port)
+    assert [check_mission(config.mission, config.vehicle) for _, config in team.members] == [[], []]
+
+
+def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
+    team: TeamConfig = load_team("carry", ["left.world.payload_radius_m=0.05", "mission.phases[2].lift_m=0.3"])
+    assert [config.world.payload_radius_m for _, config in team.members] == [0.05, 0.035]
+    assert [config.mission.phases[2].model_dump()["lift_m"] for _, config in team.members] == [0.3, 0.3]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (
+            ["right.vehicle.devices.mocap.rigid_body_id=1"],
+            "both members have devices.mocap.rigid_body_id 1; give each vehicle a rigid body of its own",
+        ),
+        (["right.vehicle.devices.team.port=14700"], "both members have devices.team.port 14700"),
+        (["right.mission.phases[2].lift_m=0.3"], "both members must fly the same phases after grip"),
+        (["left.vehicle.devices.mocap.server=192.168.1.11"], "devices.mocap.server differs between the members"),
+        (
+            ["left.vehicle.tether.anchor_world_m=[0.0,-1.9,0.0]", "right.vehicle.tether.anchor_world_m=[0.0,1.9,0.0]"],
+            "the tethers come as near as 0.",
+        ),
+        (["mission.phases[1].bar.length_m=0.6"], "the vehicles come as near as "),
+    ],
+    ids=["one body", "one port", "other phases", "two servers", "tethers", "short bar"],
+)
+def test_members_that_do_not_go_together_are_refused_in_one_line(overrides: list[str], said: str) -> None:
+    (line,) = problems(*overrides)
+    assert line.startswith(f"{CARRY}: ")
+    assert said in line
+
+
+def test_a_key_of_a_member_that_does_not_exist_is_named_with_its_place(tmp_path: Path) -> None:
+    text = CARRY.read_text().replace("vehicle.devices.mocap.rigid_body_id: 2", "vehicle.devices.mocap.rigid_body: 2")
+    path = tmp_path / "team.yaml"
+    path.write_text(text.replace("../missions", str(Path("configs/missions").resolve())))
+    with pytest.raises(ConfigError) as refused:
+        load_team(path)
+    (line,) = refused.value.lines
+    assert line.startswith(f"{path}:17:7: devices.mocap.rigid_body: unknown key")
+
+
+def test_a_mission_without_a_bar_needs_no_team(tmp_path: Path) -> None:
+    path = tmp_path / "team.yaml"
+    path.write_text(CARRY.read_text().replace("../missions/carry", f"{Path('configs/missions').resolve()}/hover"))
+    with pytest.raises(ConfigError) as refused:
+        load_team(path)
+    (line,) = refused.value.lines
+    assert line.startswith(f"{path}:6:10: mission: ")
+    assert line.endswith("has no phase of type grip, so that no team is needed")

@@ -1,0 +1,78 @@
+"""The plan of two vehicles that carry a bar, and what is refused before take-off."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from companion.config.loader import load_flight
+from companion.control.arm_model import manipulator_of
+from companion.mission.check import check_mission
+from companion.mission.plan import Plan
+from companion.model.algebra import plus
+from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.types import Reference, Vec3
+from companion.sitl_config.loader import SitlConfig
+from companion.sitl_config.team import load_team
+
+LENGTH_M = 1.2
+STEP_S = 1e-4
+
+
+def clamp_m(config: SitlConfig, r: Reference) -> Vec3:
+    tip = manipulator_of(config.vehicle).net_body_m(r.arm_rad)
+    return plus(r.position_world_m, quat_rotate(quat_from_euler_zyx(0.0, 0.0, r.yaw_rad), tip))
+
+
+def both_plans() -> list[tuple[SitlConfig, Plan, float, float]]:
+    found = []
+    for _, config in load_team("carry").members:
+        plan = Plan.build(config.mission, config.vehicle)
+        carry = plan.segments[2]
+        found.append((config, plan, carry.start_s, carry.end_s))
+    return found
+
+
+def test_both_ends_of_the_bar_move_as_one_rigid_body() -> None:
+    (left, plan_l, begin_l, end_l), (right, plan_r, begin_r, end_r) = both_plans()
+    assert end_l - begin_l == pytest.approx(end_r - begin_r)
+    turned = set()
+    for n in range(200):
+        after_s = (end_l - begin_l) * n / 200
+        a, b = plan_l.reference(begin_l + after_s), plan_r.reference(begin_r + after_s)
+        one, other = clamp_m(left, a), clamp_m(right, b)
+        assert math.dist(one, other) == pytest.approx(LENGTH_M, abs=1e-6)
+        yaw_rad = math.atan2(one[1] - other[1], one[0] - other[0])
+        assert math.cos(a.yaw_rad - yaw_rad - math.pi) == pytest.approx(1.0)
+        turned.add(round(math.degrees(yaw_rad)))
+    assert {90, 45} <= turned
+
+
+def test_velocity_and_acceleration_of_a_turning_end_are_those_of_its_path() -> None:
+    _, plan, begin_s, end_s = both_plans()[0]
+    for n in range(1, 60):
+        t_s = begin_s + (end_s - begin_s) * n / 60
+        before, now, after = (plan.reference(t_s + k * STEP_S) for k in (-1, 0, 1))
+        for axis in range(3):
+            p, v = (
+                [r.position_world_m[axis] for r in (before, now, after)],
+                [r.velocity_world_m_s[axis] for r in (before, after)],
+            )
+            assert now.velocity_world_m_s[axis] == pytest.approx((p[2] - p[0]) / (2 * STEP_S), abs=1e-5)
+            assert now.acceleration_world_m_s2[axis] == pytest.approx((v[1] - v[0]) / (2 * STEP_S), abs=1e-3)
+
+
+def test_a_bar_that_brings_the_rotors_together_is_refused() -> None:
+    config = load_team("carry").left
+    grip = config.mission.phases[1]
+    short = grip.model_copy(update={"bar": grip.bar.model_copy(update={"length_m": 0.8})})  # type: ignore[attr-defined]
+    mission = config.mission.model_copy(
+        update={"phases": (config.mission.phases[0], short, *config.mission.phases[2:])}
+    )
+    assert any("two rotor circles" in line for line in check_mission(mission, config.vehicle))
+
+
+def test_a_mission_for_two_is_not_flown_by_one() -> None:
+    config = load_flight("carry")
+    assert any("flies alone: fly a team file" in line for line in check_mission(config.mission, config.vehicle))

@@ -1,0 +1,82 @@
+"""Two vehicles and a bar in the fast loop: what happens to both when something happens to one."""
+
+from __future__ import annotations
+
+import pytest
+
+from companion.model.team import Grip
+from companion.model.types import Outcome
+from companion.sitl_config.team import load_team
+from sitl.fast.loop import FastResult
+from sitl.fast.team import FastTeam, TeamResult
+
+IDEAL = "ideal"
+
+
+def flown(*overrides: str, world: str = IDEAL) -> tuple[FastTeam, TeamResult]:
+    team = FastTeam(load_team("carry", [SHORT, *overrides], world=world))
+    return team, team.run()
+
+
+SHORT = "mission.phases[2].waypoints=[{position_m: [-0.7, 0.0], yaw_deg: 80.0}]"
+
+
+def ids(result: FastResult) -> list[str]:
+    return list(dict.fromkeys(event.id for outputs in result.outputs for event in outputs.events))
+
+
+def outcomes(result: TeamResult) -> list[Outcome | None]:
+    return [member.outputs[-1].outcome for member in result.members]
+
+
+def assert_both_down_unharmed(team: FastTeam) -> None:
+    for flight in team.flights:
+        assert not flight.plant.machine.crashed
+        assert not flight.px4.armed
+
+
+def test_both_lift_carry_set_down_and_land() -> None:
+    _, result = flown()
+    assert outcomes(result) == [Outcome.COMPLETED, Outcome.COMPLETED]
+    for member in result.members:
+        assert ids(member) == ["takeoff", "gripped", "released", "touchdown"]
+    assert result.truth is not None
+    figures = result.truth.report()
+    assert figures["bar_p_rms_m"] is not None
+    assert figures["bar_p_rms_m"] < 0.03
+    assert figures["share"] == pytest.approx(0.5, abs=0.05)
+    assert figures["let_go"] == pytest.approx(0.0, abs=0.02)
+    lifts = [
+        next(o.t_s for o in member.outputs if o.team is not None and o.team.grip is Grip.CARRYING)
+        for member in result.members
+    ]
+    assert abs(lifts[0] - lifts[1]) <= 0.0051
+
+
+def test_jaws_that_close_beside_the_handle_try_again_beside_it() -> None:
+    """The bar's body is said to be 6 cm beside where it is; the first of the places that are searched is 4 cm ahead."""
+    team, result = flown("left.world.bar={pivot_offset_m: [0.06, 0.0, 0.0]}")
+    assert "gripped_nothing" in ids(result.members[0])
+    assert outcomes(result) == [Outcome.COMPLETED, Outcome.COMPLETED]
+    assert_both_down_unharmed(team)
+
+
+@pytest.mark.parametrize("end", ["left", "right"])
+def test_a_member_whose_process_is_killed_brings_both_down(end: str) -> None:
+    team, result = flown(f"{end}.world.faults=[{{kind: kill_flight, t_s: 14.0}}]")
+    killed, other = (0, 1) if end == "left" else (1, 0)
+    assert result.members[killed].guardian_landed
+    assert {"partner_lands", "bar_let_go"} <= set(ids(result.members[other])) or "partner_silent" in ids(
+        result.members[other]
+    )
+    assert outcomes(result)[other] is Outcome.ABORTED
+    assert_both_down_unharmed(team)
+
+
+def test_a_member_that_lands_takes_the_other_and_the_bar_with_it() -> None:
+    team, result = flown("left.world.faults=[{kind: battery_sag, t_s: 14.0, size: 3.0}]")
+    assert outcomes(result) == [Outcome.ABORTED, Outcome.ABORTED]
+    assert "partner_lands" in ids(result.members[1])
+    assert_both_down_unharmed(team)
+    assert team.scene.bar is not None
+    assert team.scene.bar.let_go_m == pytest.approx(0.0, abs=0.03)
