@@ -22,6 +22,8 @@ from tests.io.test_arm import arm_config, device_on, new_servos, register, until
 from tests.support import DEADLINE_S
 
 CONFIG = Jaws(servo_id=13, open_deg=90.0, closed_deg=180.0)
+EMPTY_DEG = CONFIG.empty_deg
+"""Where jaws without a handle between them close."""
 
 
 class Clamp:
@@ -82,10 +84,10 @@ async def test_the_servo_is_set_up_and_moves_only_on_command() -> None:
         arm.command_clamp(None)
         await arm.read(1.0)
         assert register(servo, 64) == 0
-        await taken(arm, clamp, ClampCommand.CLOSE, 180.0)
+        await taken(arm, clamp, ClampCommand.CLOSE, EMPTY_DEG)
         assert register(servo, 64) == 1
         clamp.run(1.0)
-        await seen_deg(arm, 180.0)
+        await seen_deg(arm, EMPTY_DEG)
         await taken(arm, clamp, ClampCommand.OPEN, 90.0)
         clamp.run(1.0)
         await seen_deg(arm, 90.0)
@@ -99,21 +101,21 @@ async def test_a_command_that_is_lost_on_the_bus_is_repeated() -> None:
     ):
         noise = iter([True] * 5)
         bus.damaged = lambda: next(noise, False)
-        await taken(arm, clamp, ClampCommand.CLOSE, 180.0)
+        await taken(arm, clamp, ClampCommand.CLOSE, EMPTY_DEG)
         assert next(noise, None) is None and register(clamp.servo, 64) == 1
 
 
 async def test_a_closed_clamp_stays_closed_when_the_companion_falls_silent_and_when_it_starts_again() -> None:
     clamp = Clamp()
     async with on_bus(clamp) as (arm, joints):
-        await taken(arm, clamp, ClampCommand.CLOSE, 180.0)
+        await taken(arm, clamp, ClampCommand.CLOSE, EMPTY_DEG)
         clamp.run(1.0)
         for joint in joints:
             joint.update(0.0, joint.drive.angle_rad, 0.0)
             joint.update(10.0, joint.drive.angle_rad, 0.0)  # no instruction for 10 s
         clamp.run(10.0)
         assert [register(joint, 98) for joint in joints] == [255, 255]
-        assert clamp.angle_deg == pytest.approx(180.0, abs=2.0) and register(clamp.servo, 64) == 1
+        assert clamp.angle_deg == pytest.approx(EMPTY_DEG, abs=2.0) and register(clamp.servo, 64) == 1
     assert register(clamp.servo, 64) == 1 and [register(joint, 64) for joint in joints] == [0, 0]
     async with ServoBus([*new_servos(), clamp.servo]) as bus:
         never_off = [True]
@@ -125,7 +127,7 @@ async def test_a_closed_clamp_stays_closed_when_the_companion_falls_silent_and_w
 
         clamp.servo.write = watched  # type: ignore[method-assign]
         async with DynamixelArm(device_on(bus.path), arm_config(), flight_clock(), CONFIG) as arm:
-            await seen_deg(arm, 180.0)
+            await seen_deg(arm, EMPTY_DEG)
         assert len(never_off) > 1 and all(never_off)
 
 
@@ -136,7 +138,7 @@ async def test_the_turns_that_the_servo_has_lost_are_added() -> None:
     async with on_bus(clamp) as (arm, _):
         await seen_deg(arm, 90.0)
         arm.command_clamp(ClampCommand.CLOSE)
-        goal = round(-180.0 * 4096 / 360)
+        goal = round((EMPTY_DEG - 360.0) * 4096 / 360)
         await asyncio.wait_for(until(lambda: register(clamp.servo, 116, 4) == goal), DEADLINE_S)
 
 
@@ -161,7 +163,7 @@ async def test_a_servo_that_has_lost_its_settings_gives_no_angle_but_is_still_co
         old = arm.clamp()
         await arm.read(1.0)
         assert arm.clamp() == old
-        await taken(arm, clamp, ClampCommand.CLOSE, 180.0)
+        await taken(arm, clamp, ClampCommand.CLOSE, EMPTY_DEG)
         assert register(clamp.servo, 64) == 1
 
 

@@ -36,7 +36,7 @@ class JawsServo:
         self._goal_current = round(jaws.current_a / self.kind.current_unit_a)
         self._counts = {
             command: round(math.radians(angle_deg) / RAD_PER_COUNT)
-            for command, angle_deg in ((ClampCommand.OPEN, jaws.open_deg), (ClampCommand.CLOSE, jaws.closed_deg))
+            for command, angle_deg in ((ClampCommand.OPEN, jaws.open_deg), (ClampCommand.CLOSE, jaws.empty_deg))
         }
         self._turn_counts = 0
         """Whole turns to add to the servo's position; it loses their number when it is switched off."""
