@@ -134,40 +134,19 @@ class Process:
                 self.waited_for = self.waited_for or report.grant == self._granted
 
 
-class TimeKeeper:
-    """Simulated time, owned by the world.
+class MachineTime:
+    """Simulated time as the processes of one machine share it.
 
     Args:
         page: the shared page.
         channels: the world's ends of the channels to the processes of the flight, by name.
-        speed: simulated seconds in a second of real time at most.
     """
 
-    def __init__(self, page: Page, channels: Mapping[str, socket.socket], speed: float) -> None:
+    def __init__(self, page: Page, channels: Mapping[str, socket.socket]) -> None:
         self.page = page
         self.processes = {name: Process(channel) for name, channel in channels.items()}
-        self._speed = speed
         self.bus: ServoBus | None = None
         """The servo bus, which is served while a process works; None without an arm."""
-        self._from: tuple[float, float] | None = None
-        """Simulated time and wall time from which the pace is kept."""
-
-    @contextlib.contextmanager
-    def listening(self) -> Iterator[None]:
-        """Read the reports while this context is open."""
-        loop = asyncio.get_running_loop()
-        for process in self.processes.values():
-            loop.add_reader(process, self._on_report, process)
-        try:
-            yield
-        finally:
-            for process in self.processes.values():
-                loop.remove_reader(process)
-
-    def _on_report(self, process: Process) -> None:
-        process.read()
-        if process.ended:
-            asyncio.get_running_loop().remove_reader(process)
 
     def do_not_wait_for(self, name: str) -> None:
         """Go on without a process that is known to hang, until it reports again."""
@@ -178,12 +157,56 @@ class TimeKeeper:
         """Bytes that the flight has written to the servo bus."""
         return max(process.bus_bytes for process in self.processes.values())
 
+    @property
     def begins(self) -> bool:
-        """Return whether a process has asked the world to start over, once."""
-        asked = [process for process in self.processes.values() if process.begins]
-        for process in asked:
-            process.begins = False
-        return bool(asked)
+        """Whether a process has asked the world to start over."""
+        return any(process.begins for process in self.processes.values())
+
+    @property
+    def ended(self) -> bool:
+        """Whether every process has ended."""
+        return all(process.ended for process in self.processes.values())
+
+
+class TimeKeeper:
+    """Simulated time, owned by the world.
+
+    Args:
+        machines: the processes of each machine.
+        speed: simulated seconds in a second of real time at most.
+    """
+
+    def __init__(self, machines: Sequence[MachineTime], speed: float) -> None:
+        self.machines = tuple(machines)
+        self._processes = [process for machine in machines for process in machine.processes.values()]
+        self._speed = speed
+        self._from: tuple[float, float] | None = None
+        """Simulated time and wall time from which the pace is kept."""
+
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        """Read the reports while this context is open."""
+        loop = asyncio.get_running_loop()
+        for process in self._processes:
+            loop.add_reader(process, self._on_report, process)
+        try:
+            yield
+        finally:
+            for process in self._processes:
+                loop.remove_reader(process)
+
+    def _on_report(self, process: Process) -> None:
+        process.read()
+        if process.ended:
+            asyncio.get_running_loop().remove_reader(process)
+
+    def begins(self) -> bool:
+        """Return whether the world shall start over, once: each machine that has not ended has asked for it."""
+        begins = any(each.begins for each in self.machines) and all(each.begins or each.ended for each in self.machines)
+        if begins:
+            for process in self._processes:
+                process.begins = False
+        return begins
 
     def limit_to_real_time(self) -> None:
         """Never run faster than real time."""
@@ -191,8 +214,12 @@ class TimeKeeper:
 
     def set(self, now_s: float) -> None:
         """Set the simulated time, which may jump."""
-        self.page.now_s = now_s
+        self._write(now_s)
         self._from = None
+
+    def _write(self, now_s: float) -> None:
+        for machine in self.machines:
+            machine.page.now_s = now_s
 
     async def advance(self, now_s: float, data: bool) -> None:
         """Advance simulated time, let every process that wants to work do so, and keep the pace.
@@ -201,8 +228,8 @@ class TimeKeeper:
             now_s: simulated time.
             data: whether a frame of motion capture was sent.
         """
-        self.page.now_s = now_s
-        processes = tuple(self.processes.values())
+        self._write(now_s)
+        processes = self._processes
         granted = [process for process in processes if process.wants(now_s, data)]
         for process in granted:
             process.grant()
@@ -210,13 +237,14 @@ class TimeKeeper:
         await self._keep_pace(now_s, processes)
 
     def _reports(self, processes: Sequence[Process]) -> None:
-        """Wait for the reports. Meanwhile only the servo bus is served: a process waits for nothing else at this instant, and each
+        """Wait for the reports. Meanwhile only the servo buses are served: a process waits for nothing else at this instant, and each
         wake-up takes longer than most of the work that follows.
         """
         waited_s = 0.0
-        served = () if self.bus is None else (self.bus,)
+        served = [machine.bus for machine in self.machines if machine.bus is not None]
         while working := [process for process in processes if process.busy and process.waited_for]:
-            ready = select.select((*working, *served), (), (), _LOOK_S)[0]
+            waiting: list[Process | ServoBus] = [*working, *served]
+            ready = select.select(waiting, (), (), _LOOK_S)[0]
             for one in ready:
                 self._on_report(one) if isinstance(one, Process) else one.on_readable()
             if not ready:

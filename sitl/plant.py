@@ -390,6 +390,13 @@ class Plant:
             frames.append(queue.popleft())
         return [] if self.fault("mocap_loss") else frames
 
+    def mocap_at(self, exposure_t_s: float) -> MocapFrame | None:
+        """Return and remove the frame that was exposed at this time, and remove older ones; None while motion capture is lost."""
+        queue, found = self._mocap_queue, None
+        while queue and queue[0][1].exposure_t_s <= exposure_t_s + 1e-9:
+            found = queue.popleft()[1]
+        return None if self.fault("mocap_loss") else found
+
     def battery(self) -> Battery:
         """Return the measurement of the power module. If the battery effect is off, the charge falls linearly with the time since
         arming.

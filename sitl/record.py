@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from companion.analysis.pair import BarSample, BarTruth
 from companion.config.tether import Tether
 from sitl.faults.injector import Faults, Sample, sample
 from sitl.plant import Plant
+from sitl.world.scene import Scene
 
-COURSE_PERIOD_S, FRAMES_PERIOD_S = 0.01, 0.5
+COURSE_PERIOD_S, FRAMES_PERIOD_S, BAR_PERIOD_S = 0.01, 0.5, 0.02
 
 
 class TrueCourse:
@@ -49,6 +51,35 @@ class TrueCourse:
         """Return the record for the file `world.json`."""
         points = [dataclasses.astuple(point) for point in self._points]
         return {"mocap_frames": self._frames, "modes": self.modes, "course": points}
+
+
+class BarCourse:
+    """The true course of the bar that two machines carry, 50 times a second."""
+
+    def __init__(self) -> None:
+        self._rows: list[BarSample] = []
+        self._due_s = 0.0
+        self._let_go_m: float | None = None
+
+    def watch(self, scene: Scene, frame: int) -> None:
+        """Record the bar after a step, if it is due.
+
+        Args:
+            scene: a scene with a bar.
+            frame: number of the newest motion-capture frame.
+        """
+        bar = scene.bar
+        if bar is None or scene.t_s < self._due_s:
+            return
+        self._due_s = scene.t_s + BAR_PERIOD_S - 1e-6
+        self._let_go_m = bar.let_go_m
+        at, attitude = bar.pose
+        pulls = bar.force_world_n(0), bar.force_world_n(1)
+        self._rows.append(BarSample(scene.t_s, frame, at, attitude, pulls, all(bar.gripped)))
+
+    def report(self) -> BarTruth:
+        """Return the record for the file of the launcher."""
+        return BarTruth(tuple(self._rows), self._let_go_m)
 
 
 def final_report(plant: Plant) -> dict[str, Any]:

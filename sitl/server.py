@@ -1,4 +1,4 @@
-"""The simulated world behind its wires: the plant, with every device behind its real protocol.
+"""The simulated world behind its wires: a scene with one machine or more, with every device behind its real protocol.
 
 In lockstep with a flight, the world owns the time and waits for the flight (`sitl.lockstep`). On its own it follows the wall clock: if
 the process falls behind by more than `CATCH_UP_S`, the world pauses instead of catching up; `slipped_s` counts the lost time.
@@ -10,191 +10,127 @@ import asyncio
 import contextlib
 import math
 import time
-from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Callable, Sequence
 from typing import Any
 
-from companion.config.vehicle import Vehicle
-from companion.model.launcher_messages import WorldAtRest, WorldEvent, WorldMessage, WorldProgress, WorldSlipped
+from companion.model.launcher_messages import WorldEvent, WorldSlipped
 from companion.model.types import IDENTITY_QUAT
-from companion.sitl_config.world import World as WorldConfig
-from sitl.addresses import replaced, settings_of
-from sitl.autopilot.backend import AutopilotBackend, StubBackend
-from sitl.autopilot.mavlink import Ports as LinkPorts
-from sitl.external_vision import ExternalVision
-from sitl.faults.injector import Faults
-from sitl.faults.processes import SIGNALS, ProcessFaults, environment
-from sitl.force_torque import ForceTorqueServer
 from sitl.lockstep import CATCH_UP_S, LockstepLoop, TimeKeeper
 from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
-from sitl.plant import MocapFrame, Plant
+from sitl.plant import MocapFrame
 from sitl.px4.hil_link import Px4Error
-from sitl.record import TrueCourse, final_report
-from sitl.servo.bus import ServoBus
-from sitl.servo.from_config import plugged_in, servos_of
-from sitl.servo.model import ServoModel
-from sitl.world.arm_handling import ArmHandling
-from sitl.world.start import Start
+from sitl.record import BarCourse
+from sitl.wires import MachineWires
+from sitl.world.scene import Scene
 from sitl.world.state import PHYSICS_DT_S
 
 BEFORE_S = -3600.0
 """Simulated time when a world in lockstep starts; it jumps to zero when the flight begins."""
-BUS_PATIENCE_S = 1.0
-"""Wall time that bytes take at most from the companion's end of a serial line to the world's."""
 _LEAVE_S = 30.0
 SLIP_REPORTED_S = 0.1
 """A world in real time reports its pauses each time that they have grown by this much."""
 
-OnMessage = Callable[[WorldMessage], None]
-
-
-@dataclass(frozen=True, slots=True)
-class Ports:
-    """UDP ports of the standalone simulator; 0 for any free port."""
-
-    autopilot_local: int = 0
-    autopilot_remote: int = 0
-    """Port to which PX4 sends from the start; if 0, PX4 waits for the first message from a partner."""
-    mocap_command: int = 0
-    mocap_data: int = 0
-    multicast: bool = False
-
 
 class Sitl:
-    """SITL server: the simulated plant and the links to its devices.
+    """SITL server: the scene, its motion capture, and the wires of each machine.
+
+    The first machine's configuration is that of motion capture: its rate, its delays and its faults are those of the server.
 
     Args:
-        vehicle: vehicle file.
-        config: configuration of the world.
-        start: pose of the vehicle at the start.
-        ports: UDP ports.
-        on_message: called with every event, as a message for the launcher.
-        autopilot: a real PX4, or None for the stub.
+        machines: the machines.
         keeper: simulated time, for a world in lockstep; None for a world in real time.
+        make_scene: makes the scene of several machines; None for the scene that the only machine makes.
     """
 
     def __init__(
         self,
-        vehicle: Vehicle,
-        config: WorldConfig,
-        start: Start,
-        ports: Ports,
-        on_message: OnMessage,
-        autopilot: AutopilotBackend | None = None,
+        machines: Sequence[MachineWires],
         keeper: TimeKeeper | None = None,
+        make_scene: Callable[[], Scene] | None = None,
     ) -> None:
         self._keeper = keeper
-        self._vehicle = vehicle
-        self._config = config
-        self._on_message = on_message
-        self.servos = servos_of(vehicle, config)
-        self._on_bus = plugged_in(self.servos, config)
-        stub_ports = LinkPorts(ports.autopilot_local, ports.autopilot_remote)
-        self.autopilot: AutopilotBackend = autopilot or StubBackend(
-            vehicle.airframe,
-            config,
-            stub_ports,
-            external_vision=vehicle.devices.mocap.external,
-            in_lockstep=keeper is not None,
-        )
-        self._start = start
+        self.machines = tuple(machines)
+        self._make_scene = make_scene
+        scene = None if make_scene is None else make_scene()
+        for number, machine in enumerate(machines):
+            machine.make_plant(scene, number)
+        self.bar: BarCourse | None = None if scene is None or scene.bar is None else BarCourse()
+        """What the bar that the machines carry does; None without one."""
         self._sent_frame = False
         """Whether motion capture has sent a frame in this step."""
-        self._make_plant()
-        self.bus: ServoBus | None = None
-        """The servo bus; None if the vehicle has no arm, or while the links are not open."""
-        self.mocap: NatNetServer | ExternalVision | None = None
-        """The simulated motion capture; None while the links are not open."""
-        self.force: ForceTorqueServer | None = None
-        """The emulated force sensor; None if the vehicle has none, or while the links are not open."""
-        other = config.mocap_other_id
+        self.mocap: NatNetServer | None = None
+        """The simulated motion capture; None while the links are not open, and if another program feeds PX4 with poses."""
+        first = self.machines[0]
+        other, mocap = first.config.mocap_other_id, first.vehicle.devices.mocap
         self._others = () if other is None else ((other, OTHER_BODY),)
-        self._ball = vehicle.devices.mocap.ball
+        self._ball = mocap.ball
         """How motion capture sees the ball; None if the mission does not follow it."""
-        self._arm_handling = ArmHandling(vehicle.arm, start.arm_rad) if config.arm_handling and self.servos else None
-        self.flight = ProcessFaults()
-        self._course = TrueCourse()
-        self._ports = ports
+        self._bar_body = () if mocap.bar_id is None else ((mocap.bar_id, "bar"),)
+        """Id and name of the bar's rigid body; empty if it has none."""
         self.slipped_s = self._slip_reported_s = 0.0
         self._origin_s = 0.0
         """World time 0 on the event loop's clock."""
         self._next_frame: asyncio.TimerHandle | None = None
         """Timer that sends a frame between two steps."""
-        self._at_rest = False
         self._leaving = False
         self._end_s = math.inf
-        self._lost_servo: ServoModel | None = None
 
-    def _make_plant(self) -> None:
-        vehicle, config = self._vehicle, self._config
-        # In lockstep as in the fast closed loop: cameras expose at the end of a step, and all else happens there, too.
-        between_steps = self._keeper is None
-        self.plant = Plant(vehicle, config, self.autopilot, self.servos, self._start, between_steps=between_steps)
-        self.autopilot.attach(self.plant.machine)
-        self.faults = Faults(
-            config,
-            self.plant.scene,
-            self.plant.machine,
-            self.autopilot.fault_target,
-            [servo.drive for servo in self.servos],
-            vehicle.tether,
-            self.servos,
-        )
-        if config.faults:
-            self.plant.faults = self.faults
+    @property
+    def _scene(self) -> Scene:
+        return self.machines[0].plant.scene
+
+    @property
+    def _t_s(self) -> float:
+        return self._scene.t_s
+
+    @property
+    def _lockstep(self) -> bool:
+        """Whether a real PX4 flies."""
+        return any(machine.autopilot.lockstep for machine in self.machines)
+
+    @property
+    def _armed(self) -> bool:
+        return any(machine.autopilot.armed for machine in self.machines)
 
     def _start_over(self) -> None:
         """Put the world back to its beginning, as the flight begins: what happens in the flight does not depend on how long the
         preflight took. What the companion has set in the devices stays.
         """
         assert self._keeper is not None
-        if not self.autopilot.start_over():
+        if self._armed or not all(machine.autopilot.start_over() for machine in self.machines):
             return
-        for servo in self.servos:
-            servo.drive.start_over()
-        self._make_plant()
-        if self.force is not None:
-            self.force.start_over()
-        if isinstance(self.mocap, NatNetServer):
+        scene = None if self._make_scene is None else self._make_scene()
+        for number, machine in enumerate(self.machines):
+            machine.start_over(scene, number)
+        if self.mocap is not None:
             self.mocap.start_over()
-        self._course = TrueCourse()
-        self.flight.start_over()
+        if self.bar is not None:
+            self.bar = BarCourse()
         self._keeper.set(0.0)
 
     @contextlib.asynccontextmanager
-    async def wires(self) -> AsyncIterator[dict[str, dict[str, Any]]]:
-        """Open every link and yield the addresses in the form of a vehicle file's `devices` settings."""
-        device = self._vehicle.devices
+    async def wires(self) -> AsyncIterator[tuple[dict[str, dict[str, Any]], ...]]:
+        """Open every link and yield the addresses of each machine in the form of a vehicle file's `devices` settings."""
         async with contextlib.AsyncExitStack() as stack:
-            if device.arm is not None:
-                page = None if self._keeper is None else self._keeper.page
-                self.bus = await stack.enter_async_context(ServoBus(self._on_bus, page=page))
-            if device.force is not None:
-                sensor = ForceTorqueServer(in_lockstep=self._keeper is not None)
-                self.force = await stack.enter_async_context(sensor)
-            if not device.mocap.external:
+            if not self.machines[0].vehicle.devices.mocap.external:
                 self.mocap = await stack.enter_async_context(self._natnet_server())
-            px4 = await stack.enter_async_context(self.autopilot.wires())
-            if device.mocap.external:
-                self.mocap = await stack.enter_async_context(ExternalVision(self.autopilot.vision_address))
-            natnet = self.mocap if isinstance(self.mocap, NatNetServer) else None
-            rate_hz, multicast = self._config.mocap_rate_hz, self._ports.multicast
-            addresses = {"autopilot": {"address": px4}} | settings_of(
-                device, natnet, rate_hz, multicast, self.bus, self.force
-            )
-            for text in replaced(device, addresses):
-                self._on_message(WorldProgress(text))
-            yield addresses
+            yield tuple([await stack.enter_async_context(machine.wires(self.mocap)) for machine in self.machines])
 
     def _natnet_server(self) -> NatNetServer:
-        mocap = self._vehicle.devices.mocap
+        first = self.machines[0]
+        ports = first.ports
         return NatNetServer(
-            version=self._config.natnet_version,
-            command_port=self._ports.mocap_command,
-            data_port=self._ports.mocap_data,
-            multicast_group=mocap.multicast_group if self._ports.multicast else None,
-            bodies=((mocap.rigid_body_id, self._vehicle.name), *self._others, *self._ball_body),
-            clock=asyncio.get_running_loop().time if self._keeper is None else lambda: self.plant.t_s,
+            version=first.config.natnet_version,
+            command_port=ports.mocap_command,
+            data_port=ports.mocap_data,
+            multicast_group=first.vehicle.devices.mocap.multicast_group if ports.multicast else None,
+            bodies=(
+                *((each.vehicle.devices.mocap.rigid_body_id, each.vehicle.name) for each in self.machines),
+                *self._others,
+                *self._ball_body,
+                *self._bar_body,
+            ),
+            clock=asyncio.get_running_loop().time if self._keeper is None else lambda: self._t_s,
             stamps=self._server_clock_s,
         )
 
@@ -205,29 +141,24 @@ class Sitl:
 
     def _server_clock_s(self) -> float:
         """Return the clock of the motion-capture server, with which `_publish` stamps frames."""
-        now_s = self.plant.t_s if self._keeper is not None else time.monotonic() - self._origin_s
-        return self.faults.server_clock_s(now_s) + self._ahead_s
+        now_s = self._t_s if self._keeper is not None else time.monotonic() - self._origin_s
+        return self.machines[0].faults.server_clock_s(now_s) + self._ahead_s
 
     @property
     def _ahead_s(self) -> float:
-        return 0.0 if self.autopilot.lockstep else self.slipped_s
-
-    def flight_environment(self) -> dict[str, str]:
-        """Return the environment variables that the flight process needs for faults that hang it."""
-        stalls = [fault.duration_s for fault in self._config.faults if fault.kind == "stall_loop"]
-        return environment({fault.kind for fault in self._config.faults}, stalls[0] if stalls else None)
+        return 0.0 if self._lockstep else self.slipped_s
 
     def stop(self) -> None:
         """End `run` at the next step."""
         self._end_s = -math.inf
 
     def leave(self) -> None:
-        """End `run` as soon as the vehicle is disarmed, or after `_LEAVE_S` if it is still armed."""
+        """End `run` as soon as every vehicle is disarmed, or after `_LEAVE_S` if one is still armed."""
         self._leaving = True
-        self._end_s = min(self._end_s, self.plant.t_s + _LEAVE_S)
+        self._end_s = min(self._end_s, self._t_s + _LEAVE_S)
 
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Run the world until `stop` or `leave` ends it; call `on_ready` once the autopilot is ready to fly.
+        """Run the world until `stop` or `leave` ends it; call `on_ready` once every autopilot is ready to fly.
 
         Raises:
             Px4Error: a real PX4 cannot be started, has ended or hangs.
@@ -245,69 +176,91 @@ class Sitl:
             raise errors.exceptions[0] from None
 
     async def _prepare(self, on_ready: Callable[[], None]) -> None:
-        await self.autopilot.prepare()
+        for machine in self.machines:
+            await machine.autopilot.prepare()
         on_ready()
 
     @property
     def _ends(self) -> bool:
-        return self.plant.t_s >= self._end_s or (self._leaving and not self.autopilot.armed)
+        return self._t_s >= self._end_s or (self._leaving and not self._armed)
+
+    async def _answered(self) -> None:
+        for machine in self.machines:
+            if machine.autopilot.lockstep:
+                await machine.autopilot.answered()
 
     async def _in_lockstep(self, keeper: TimeKeeper) -> None:
         """Step, let the flight do what it does at this instant, and so on."""
         loop = asyncio.get_running_loop()
         assert isinstance(loop, LockstepLoop)
-        if self.autopilot.lockstep:  # threads of a real PX4 send its telemetry on the computer's clock
+        if self._lockstep:  # threads of a real PX4 send its telemetry on the computer's clock
             keeper.limit_to_real_time()
-        before_s = 0.0 if self.autopilot.lockstep else BEFORE_S
-        keeper.set(before_s + self.plant.t_s)
-        keeper.bus = self.bus
+        before_s = 0.0 if self._lockstep else BEFORE_S
+        keeper.set(before_s + self._t_s)
+        for machine in self.machines:
+            if machine.time is not None:
+                machine.time.bus = machine.bus
         with keeper.listening():
             while not self._ends:
-                if self.autopilot.lockstep:
-                    await self.autopilot.answered()
+                await self._answered()
                 self._sent_frame = False
                 self._step()
-                if self.force is not None:
-                    self.force.await_arrival()
-                await keeper.advance(before_s + self.plant.t_s, self._sent_frame)
-                if self.bus is not None:
-                    self.bus.take(keeper.bus_bytes, BUS_PATIENCE_S)
+                for machine in self.machines:
+                    if machine.force is not None:
+                        machine.force.await_arrival()
+                await keeper.advance(before_s + self._t_s, self._sent_frame)
+                for machine in self.machines:
+                    machine.take_bus()
                 await loop.handle_all()
                 if keeper.begins():
-                    plant = self.plant
+                    scene = self._scene
                     self._start_over()
-                    before_s = before_s if self.plant is plant else 0.0
+                    before_s = before_s if self._scene is scene else 0.0
 
     async def _follow_clock(self) -> None:
-        lockstep = self.autopilot.lockstep
-        origin_s = self._origin_s = time.monotonic() - self.plant.t_s
+        origin_s = self._origin_s = time.monotonic() - self._t_s
         while not self._ends:
-            behind_s = time.monotonic() - origin_s - self.plant.t_s
+            behind_s = time.monotonic() - origin_s - self._t_s
             if behind_s > CATCH_UP_S:
                 origin_s = self._origin_s = origin_s + behind_s - CATCH_UP_S
                 self.slipped_s += behind_s - CATCH_UP_S
-                if self.slipped_s >= self._slip_reported_s + SLIP_REPORTED_S:
+                slip_is_news = self.slipped_s >= self._slip_reported_s + SLIP_REPORTED_S
+                if slip_is_news:
                     self._slip_reported_s = self.slipped_s
-                    self._on_message(WorldSlipped(self.slipped_s))
-                self.autopilot.skip(behind_s - CATCH_UP_S)
+                for machine in self.machines:
+                    if slip_is_news:
+                        machine.on_message(WorldSlipped(self.slipped_s))
+                    machine.autopilot.skip(behind_s - CATCH_UP_S)
                 behind_s = CATCH_UP_S
             for _ in range(int(behind_s / PHYSICS_DT_S)):
-                if lockstep:
-                    await self.autopilot.answered()
+                await self._answered()
                 self._step()
-            ahead_s = self.plant.t_s + PHYSICS_DT_S - (time.monotonic() - origin_s)
+            ahead_s = self._t_s + PHYSICS_DT_S - (time.monotonic() - origin_s)
             await asyncio.sleep(max(0.0, ahead_s))
 
     def _step(self) -> None:
-        plant = self.plant
-        if plant.faults is not None:
-            self._apply_faults()
-        autopilot = self.autopilot
-        if self._arm_handling is not None and not autopilot.armed:
-            self._hold_arm(self._arm_handling)
-        plant.step(autopilot.armed)
-        if autopilot.lockstep and plant.imu_due:
-            autopilot.sense(plant.sample_imu())
+        machines, scene = self.machines, self._scene
+        number = 0 if self.mocap is None else self.mocap.frame_number
+        for machine in machines:
+            machine.before_step(number)
+        airborne = scene.bar is None and machines[0].autopilot.armed
+        for machine in machines:
+            machine.plant.act(machine.autopilot.armed)
+        scene.step(airborne)
+        for machine in machines:
+            machine.sense()
+        if self.bar is not None:
+            self.bar.watch(scene, number)
+        self._send_frames()
+        for machine in machines:
+            machine.after_step()
+        for event in scene.take_events():
+            machines[0].on_message(WorldEvent(event.kind, event.t_s))
+        for machine in machines:
+            machine.report_rest()
+
+    def _send_frames(self) -> None:
+        plant = self.machines[0].plant
         ahead_s = PHYSICS_DT_S - 1e-6 if self._keeper is None else 0.0
         for leaves_s, frame in plant.mocap_until(plant.t_s + ahead_s):
             if leaves_s <= plant.t_s:
@@ -315,97 +268,29 @@ class Sitl:
             else:
                 loop = asyncio.get_running_loop()
                 self._next_frame = loop.call_at(self._origin_s + leaves_s, self._publish, frame, leaves_s)
-        if self.force is not None:
-            plant.force_is_read = self.force.streaming
-            if self._keeper is None or self.force.due(plant.t_s) or not self.force.streaming:
-                self.force.set_wrench(*plant.force_torque())
-            self.force.tick(plant.t_s)
-        autopilot.pump(plant.t_s, plant.battery())
-        observed, armed = autopilot.observe(), autopilot.armed
-        mode = None if observed.nav_state is None else observed.nav_state.name
-        self._course.watch_mode(plant.t_s, mode, armed)
-        if self.flight.watch(plant.t_s, *observed, armed):
-            self.flight.sample(plant.truth.position_world_m, plant.truth.attitude_wxyz)
-        for event in plant.scene.take_events():
-            self._on_message(WorldEvent(event.kind, event.t_s))
-        at_rest = not armed
-        if at_rest != self._at_rest:
-            self._at_rest = at_rest
-            self._on_message(WorldAtRest(at_rest))
-
-    def _hold_arm(self, hand: ArmHandling) -> None:
-        servos, machine = self.servos, self.plant.machine
-        held = hand.angles_rad(
-            self.plant.t_s,
-            not any(servo.drive.torque_on for servo in servos),
-            tuple(machine.q[index] for index in machine.layout.joint_q),
-            max(servo.lights for servo in servos),
-            any(servo.lit for servo in servos),
-        )
-        if held is not None:
-            machine.hold_arm(held)
 
     def _publish(self, frame: MocapFrame, t_s: float) -> None:
+        """Send a frame of the first machine's, with the bodies of the others as the cameras saw them at the same time."""
         self._sent_frame = True
-        if isinstance(self.mocap, ExternalVision):
-            self.mocap.publish(frame, t_s)
+        first = self.machines[0]
+        if first.vision is not None:
+            first.vision.publish(frame, t_s)
             return
         if self.mocap is None:
             return
-        body = self._vehicle.devices.mocap.rigid_body_id
-        pose = BodyPose(body, frame.position_world_m, frame.attitude_wxyz, frame.valid)
-        others = [BodyPose(number, OTHER_PLACE_M, IDENTITY_QUAT) for number, _ in self._others]
-        others += [
+        poses = [BodyPose(number, OTHER_PLACE_M, IDENTITY_QUAT) for number, _ in self._others]
+        poses += [
             BodyPose(number, (*frame.markers, (0.0, 0.0, 0.0))[0], IDENTITY_QUAT, bool(frame.markers))
             for number, _ in self._ball_body
         ]
-        clock, ahead_s = self.faults.server_clock_s, self._ahead_s
+        if frame.bar is not None:
+            poses += [BodyPose(number, *frame.bar) for number, _ in self._bar_body]
+        for machine in self.machines:
+            seen = frame if machine is first else machine.plant.mocap_at(frame.exposure_t_s)
+            body = machine.vehicle.devices.mocap.rigid_body_id
+            if seen is not None:
+                poses.append(BodyPose(body, seen.position_world_m, seen.attitude_wxyz, seen.valid))
+        clock, ahead_s = first.faults.server_clock_s, self._ahead_s
         sent_s = t_s - frame.network_s
         single = {"markers": frame.markers} if self._ball is not None and not self._ball_body else {}
-        self.mocap.publish(clock(sent_s) + ahead_s, (*others, pose), clock(frame.exposure_t_s) + ahead_s, **single)
-
-    def _apply_faults(self) -> None:
-        plant = self.plant
-        for kind in SIGNALS:
-            if plant.fault(kind) is not None:
-                seen = self.autopilot.observe()
-                injected = self.flight.inject(kind, plant.t_s, plant.truth.position_world_m, seen.vision_received)
-                if injected and self._keeper is not None:
-                    self._keeper.do_not_wait_for("flight")
-        self.flight.inject_others(self.faults.active.keys(), plant.t_s)
-        frame = self.mocap.frame_number if isinstance(self.mocap, NatNetServer) else 0
-        self._course.watch(plant, self.faults, self._vehicle.tether, frame)
-        down = plant.fault("link_loss") is not None or self.autopilot.down
-        self.autopilot.set_link(down, self.faults.size("link_delay"))
-        if self.bus is not None:
-            self.bus.damaged = self.faults.packet_lost
-            self.bus.answers_late_s = self.faults.size("bus_delay")
-        if self.force is not None:
-            self.force.silent = plant.fault("force_loss") is not None
-        fault = plant.fault("servo_loss")
-        if fault is not None:
-            self._lost_servo = self.servos[fault.servo - 1]
-            self._lost_servo.fail_silent(True)
-        elif self._lost_servo is not None:
-            self._lost_servo.fail_silent(False)
-            self._lost_servo = None
-
-    def ground_truth(self) -> dict[str, Any]:
-        """Return the true course of a flight with faults, for a campaign's table (file `world.json`)."""
-        return {
-            **self.final(),
-            "armed": self.autopilot.armed,
-            "fault_begun_s": self.faults.begun_s,
-            **self._course.report(),
-        }
-
-    def final(self) -> dict[str, Any]:
-        """Return the world's report at the end of a flight, for `summary.json`."""
-        return {
-            "autopilot": self.autopilot.about(),
-            "payload_kg": self._config.payload_kg,
-            "knobs": self._config.model_dump(mode="json"),
-            **final_report(self.plant),
-            "slipped_s": self.slipped_s,
-            "flight_fault": self.flight.report(),
-        }
+        self.mocap.publish(clock(sent_s) + ahead_s, poses, clock(frame.exposure_t_s) + ahead_s, **single)

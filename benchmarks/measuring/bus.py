@@ -92,7 +92,7 @@ def bare_dynamixel_in_world(cycles: int, mission: Path, folder: Path) -> BusCycl
     Raises:
         LaunchError: the world did not start.
     """
-    world = SitlProcess(load_sitl(mission), folder)
+    world = SitlProcess.start(load_sitl(mission), folder)
     try:
         return _bus_cycles(world.devices()["arm"]["port"], cycles)
     finally:

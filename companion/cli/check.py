@@ -65,15 +65,21 @@ _MARK_WIDTH, _TITLE_WIDTH, _WIDTH_MAX, _GAP = 4, 34, 160, 2
 _STYLES = {"ok": "green", "WARN": "yellow", "FAIL": "bold red"}
 
 
-def run(arguments: argparse.Namespace, config: SitlConfig) -> int:
-    """Run the command and return the exit code."""
+def run(arguments: argparse.Namespace, config: SitlConfig, world: SitlProcess | None = None) -> int:
+    """Run the command and return the exit code.
+
+    Args:
+        arguments: options of the command.
+        config: checked configuration.
+        world: with `--sitl`, a world that runs already; None to start one.
+    """
     found = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
     if arguments.plan_only:
         return _plan_only(arguments, config, found)
     people = console_on(sys.stderr)
     scratch = Path(tempfile.mkdtemp(prefix="companion-check-"))
     try:
-        rows = _rows(arguments, config, tuple(found), scratch, people)
+        rows = _rows(arguments, config, tuple(found), scratch, people, world)
     except LaunchError as error:  # it names a log, which is kept
         print_error(f"companion check: {error}")
         return EXIT_REFUSED
@@ -118,7 +124,12 @@ def _poses(vehicle: Vehicle) -> Iterator[str]:
 
 
 def _rows(
-    arguments: argparse.Namespace, sitl_config: SitlConfig, plan: tuple[str, ...], scratch: Path, people: Console
+    arguments: argparse.Namespace,
+    sitl_config: SitlConfig,
+    plan: tuple[str, ...],
+    scratch: Path,
+    people: Console,
+    world: SitlProcess | None,
 ) -> list[Row]:
     """Return the rows of all checks.
 
@@ -130,8 +141,9 @@ def _rows(
         line = stack.enter_context(_Line(people))
         if arguments.sitl is not None:
             line("starting the simulated world")
-            world = SitlProcess(sitl_config, scratch, px4=arguments.sitl == "px4")
-            stack.callback(world.stop)
+            if world is None:
+                world = SitlProcess.start(sitl_config, scratch, px4=arguments.sitl == "px4")
+                stack.callback(world.stop)
             config = replace_device_settings(config, world.devices(line.world))
         line("recorder")
         known = Observations(

@@ -21,6 +21,7 @@ from companion.mission.check import check_mission
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.runtime.console import print_error, terminal_console
 from companion.sitl_config.loader import COMMAND_LINE_WORLD, DEFAULT_WORLD, SitlConfig, load_sitl
+from companion.sitl_config.team import ENDS, load_team
 
 
 def add_parser(commands: Any) -> None:
@@ -60,6 +61,7 @@ def add_parser(commands: Any) -> None:
     fly.add_argument(
         "--wait-for-start", action="store_true", help="when ready, wait on the ground until an operator commands start"
     )
+    _add_member(fly)
     fly.set_defaults(run=_fly)
 
     check = commands.add_parser(
@@ -74,6 +76,7 @@ def add_parser(commands: Any) -> None:
     check.add_argument("--hand", action="store_true", help="also run the guided hand test, which a new set-up requires")
     check.add_argument("--json", action="store_true", help="print only the rows, as JSON")
     check.add_argument("--plan-only", action="store_true", help="check only the mission, without devices")
+    _add_member(check)
     check.set_defaults(run=_check)
 
     schema = commands.add_parser("schema", help="print the JSON Schema of a file, for editors")
@@ -90,6 +93,12 @@ def add_parser(commands: Any) -> None:
     )
     replay.add_argument("log", type=Path)
     replay.set_defaults(run=_replay)
+
+
+def _add_member(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--member", choices=ENDS, help="MISSION is a team file, and this is the vehicle at that end of the bar"
+    )
 
 
 def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool = False) -> None:
@@ -110,6 +119,17 @@ def _load(arguments: argparse.Namespace, *, hardware: bool, real_px4: bool = Fal
     for name, path in (("MISSION", arguments.mission), ("--vehicle", arguments.vehicle)):
         if path is not None and not path.strip():
             raise ConfigError(f"companion {arguments.command}: {name}: expected the name of a file, got an empty one")
+    # Nothing of a world is read on hardware, and drawing one takes NumPy.
+    world = DEFAULT_WORLD if hardware and arguments.world == COMMAND_LINE_WORLD else arguments.world
+    if getattr(arguments, "member", None) is not None:
+        if not hardware:
+            text = "expected only on the vehicle; in the simulated world both fly: companion team fly FILE --sitl"
+            raise ConfigError([f"companion {arguments.command}: --member {arguments.member}: {text}"])
+        law, preset = arguments.controller, arguments.preset
+        team = load_team(
+            arguments.mission, arguments.overrides, controller_law=law, preset=preset, hardware=True, world=world
+        )
+        return dict(team.members)[arguments.member]
     return load_sitl(
         arguments.mission,
         arguments.vehicle,
@@ -117,8 +137,7 @@ def _load(arguments: argparse.Namespace, *, hardware: bool, real_px4: bool = Fal
         arguments.preset,
         arguments.overrides,
         hardware=hardware,
-        # Nothing of a world is read on hardware, and drawing one takes NumPy.
-        world=DEFAULT_WORLD if hardware and arguments.world == COMMAND_LINE_WORLD else arguments.world,
+        world=world,
         real_px4=real_px4,
     )
 
@@ -140,7 +159,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     if arguments.sitl not in (None, "stub", "px4"):
         print_error(f"companion fly: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
         return EXIT_BAD_INPUT
-    speed = _speed(arguments)
+    speed = speed_of(arguments)
     if speed is not None and not speed > 0.0:
         return EXIT_BAD_INPUT
     if arguments.out is not None and not arguments.out.strip():
@@ -175,7 +194,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     )
 
 
-def _speed(arguments: argparse.Namespace) -> float | None:
+def speed_of(arguments: argparse.Namespace) -> float | None:
     """Return the speed of a flight in simulated time, or None for one in real time; 0 if the options are invalid, after a line."""
     given = arguments.speed
     problem = None
@@ -196,7 +215,7 @@ def _speed(arguments: argparse.Namespace) -> float | None:
         if 0.0 < speed < math.inf:
             return speed
         problem = f"--speed {given}: expected a number above 0, such as 0.25, or max"
-    print_error(f"companion fly: {problem}")
+    print_error(f"companion {arguments.command}: {problem}")
     return 0.0
 
 

@@ -17,7 +17,7 @@ _OF_FLIGHT = ("fly", "check", "schema", "sitl", "replay")
 """Commands whose parsers are in `companion.cli.flight`."""
 _WITH_MODULES = (
     "compare", "robustness", "faults", "tune", "hover", "identify", "install", "arm", "px4", "mocap", "ft", "latency", "monitor",
-    "command", "broker", "report", "export", "init", "plugins",
+    "command", "broker", "report", "export", "init", "plugins", "team",
 )  # fmt: skip
 """Commands whose parser is in `companion.cli.NAME`."""
 _ADDRESS = re.compile(r"[^/]*:\d+")

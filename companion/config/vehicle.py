@@ -180,6 +180,13 @@ class Vehicle(Model):
             yield from (
                 (("arm", "joints", index, "servo"), text) for index, one in enumerate(joints) if one.servo is not None
             )
+        if self.jaws is not None and device is not None:
+            if device.type != DYNAMIXEL:
+                yield ("tool", "jaws"), f"a clamp needs devices.arm.type {DYNAMIXEL}, got {device.type}"
+            for number, joint in enumerate(joints, 1):
+                if joint.servo_id == self.jaws.servo_id:
+                    text = f"joint {number} has the servo id {joint.servo_id} too; give each servo its own id"
+                    yield ("tool", "jaws", "servo_id"), text
         if self.safety.servo_current_max_a is not None and any(joint.servo is None for joint in joints):
             yield ("safety", "servo_current_max_a"), "must be null, because arm.joints[].servo is null"
 

@@ -162,6 +162,9 @@ class Flight:
             guardian_ready=self._guardian.ready if self._guardian is not None else None,
             estimator=devices.autopilot.estimator() if self._external else None,
             markers=devices.mocap.markers() if devices.mocap is not None else None,
+            clamp=devices.arm.clamp() if devices.arm is not None else None,
+            bar=devices.mocap.bar() if devices.mocap is not None else None,
+            partner=devices.team.newest() if devices.team is not None else None,
         )
         self._vehicle = inputs.vehicle
         outputs = self._core.step(inputs)
@@ -174,6 +177,10 @@ class Flight:
         if outputs.arm_torque_nm is not None and devices.arm is not None:
             torque_sent = devices.arm.write_torque(outputs.arm_torque_nm)
         current_s = self._clock()
+        if devices.arm is not None:
+            devices.arm.command_clamp(outputs.clamp)
+        if devices.team is not None and outputs.team is not None:
+            devices.team.announce(outputs.team)
         if outputs.request is not AutopilotRequest.NONE:
             devices.autopilot.request(outputs.request)
         sent = Sent(

@@ -151,6 +151,9 @@ async def fly(
                     os._exit(EXIT_INTERNAL)  # end at once: the guardian lands, and this process must not disturb it
                 flight.judge_without_core()
                 outcome = await land_without_core(devices.autopilot, channel, clock, guardian)
+            if devices.team is not None:
+                counts = devices.team.counts()._asdict()
+                recorder.client.metadata("team_link", {name: str(count) for name, count in counts.items()})
             if guardian is not None and outcome is not Outcome.LOST:
                 guardian.goodbye(devices.autopilot.status())
         finally:

@@ -29,7 +29,7 @@ class GuardianMocap:
     """
 
     def __init__(self, settings: MocapSettings, clock: Clock = monotonic) -> None:
-        self._clock, settings = clock, dataclasses.replace(settings, ball=None)
+        self._clock, settings = clock, dataclasses.replace(settings, ball=None, bar_id=None)
         try:
             self._client = ContainedClient(_make(settings), settings, clock)
         except DeviceError:

@@ -27,10 +27,12 @@ from companion.guardian.takeover_landing import Notice, TakeoverLanding
 from companion.io.protocols import DeviceError
 from companion.io.px4.wire import OpenWire, is_udp, open_wire
 from companion.io.reopening import Reopening
+from companion.io.team_link import TeamSender
 from companion.model.codec import to_packet
 from companion.model.launcher_messages import FlightEvent, GuardianEnded, GuardianStatus, TookOver
 from companion.model.packets import LogLine
-from companion.model.types import SafetyAction, Severity
+from companion.model.team import Grip, TeamState
+from companion.model.types import SafetyAction, Severity, Vec3
 from companion.runtime import ipc, simulated_time
 from companion.runtime.clock import monotonic
 from companion.runtime.realtime import GUARDIAN_PRIORITY, claim_realtime
@@ -124,6 +126,8 @@ class Guardian:
         self._external = settings.mocap.type == "external"
         self._mocap: GuardianMocap | None = None
         """None until it is open, and if another program feeds PX4, which then needs no poses from the guardian."""
+        self._team: TeamSender | None = None
+        """Sends this vehicle's state to the other of a team, once the flight process is dead; None for a vehicle that flies alone."""
         self._problem: str | None = None
         self._status_s = float("-inf")
         self._errors: set[str] = set()
@@ -142,6 +146,8 @@ class Guardian:
             try:
                 if not self._external:
                     self._mocap = GuardianMocap(self._settings.mocap)
+                if self._settings.team is not None:
+                    self._team = TeamSender(self._settings.team)
             except DeviceError as problem:
                 self._problem = str(problem)
             reason = self._stand_by()
@@ -155,6 +161,8 @@ class Guardian:
             )
             if self._mocap is not None:
                 self._mocap.close()
+            if self._team is not None:
+                self._team.close()
             if self._heartbeats.recorder is not None:
                 self._heartbeats.recorder.close()
 
@@ -237,6 +245,7 @@ class Guardian:
             if monotonic() > deadline_s:
                 return None
             self._send_status()
+            self._announce(last.position_world_m)
             simulated_time.wait(select.poll(), PERIOD_S, data=False)
 
     def _open_wire(self, last: Heartbeat) -> OpenWire:
@@ -309,6 +318,7 @@ class Guardian:
                 with self._contain_errors(last, landing, "the landing"):
                     landing.step(t_s)
             self._send_status()
+            self._announce(last.position_world_m if landing.pose is None else landing.pose.position_world_m)
         self._send_result(landing.landed, landing)
         return landing.landed
 
@@ -329,6 +339,12 @@ class Guardian:
                 )
             if what == "the landing":
                 landing.restart(t_s)
+
+    def _announce(self, position_world_m: Vec3) -> None:
+        """Tell the other vehicle of a team that PX4 lands this one, and that it will not lift the bar."""
+        if self._team is not None:
+            said = TeamState(grip=Grip.FREE, holds=True, lands=True, px4_lands=True, position_world_m=position_world_m)
+            self._team.announce(said, monotonic())
 
     def _send_status(self) -> None:
         """Send a status message to the launcher, twice a second."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.io.mocap.system import MocapSettings
+from companion.io.team_link import TeamSettings
 from companion.safety.pose_filter import PoseLimits
 
 
@@ -26,6 +27,8 @@ class Settings:
     """`safety.guardian_timeout_s`."""
     pose_limits: PoseLimits
     """Limits of a pose that is sent to PX4, as in the flight process."""
+    team: TeamSettings | None = None
+    """`devices.team`; None for a vehicle that flies alone."""
 
 
 def read_settings(path: Path) -> Settings:
@@ -45,4 +48,5 @@ def read_settings(path: Path) -> Settings:
             disagreement_m=safety["estimate_disagreement_m"],
             latency_max_s=max(safety["mocap_latency_warn_s"], safety["mocap_latency_max_s"]),
         ),
+        team=None if devices.get("team") is None else TeamSettings(**devices["team"]),
     )

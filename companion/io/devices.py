@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass, field
 
 from companion.config.arm import Arm as ArmConfig
+from companion.config.arm import Jaws
 from companion.config.device_plugins import DYNAMIXEL
 from companion.config.devices import ArmDevice
 from companion.config.loader import FlightConfig
@@ -15,10 +16,11 @@ from companion.io.arm.plugin_driver import PluginArm
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.force_torque.plugin_driver import open_force
 from companion.io.mocap.driver import MocapDriver
-from companion.io.protocols import Arm, Autopilot, DeviceError, ForceTorque, GroundLink, Mocap
+from companion.io.protocols import Arm, Autopilot, DeviceError, ForceTorque, GroundLink, Mocap, Team
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.px4.streams import ESTIMATOR_RATE_HZ
 from companion.io.qgroundcontrol.station import GroundStation, check_address
+from companion.io.team_link import TeamLink, TeamSettings
 from companion.model.estimator import WATCHED_RATE_HZ
 from companion.model.flight_stage import is_armed
 from companion.model.types import MocapPose
@@ -57,6 +59,8 @@ class Devices:
     """PX4 was armed when its link was opened."""
     failures: tuple[str, ...] = ()
     """Error lines of the devices that could not be opened, if PX4 was found armed."""
+    team: Team | None = None
+    """Link to the other vehicle of a team; None for a vehicle that flies alone."""
     ground: GroundLink | None = None
     """Link to a MAVLink ground station; None if MAVLink is not forwarded."""
 
@@ -113,6 +117,12 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
             except TimeoutError:
                 device = config.vehicle.arm_device
                 failures.append(f"arm {device.port or device.type}: not open within {ARM_TIMEOUT_S:g} s")
+            team: Team | None = None
+            try:
+                if (link := _team(config, clock)) is not None:
+                    team = await stack.enter_async_context(link)
+            except DeviceError as error:
+                failures.append(str(error))
             if ground_address is not None:
                 failures.append(
                     f"ground.qgroundcontrol {ground_address}: MAVLink is not forwarded because PX4 was found armed"
@@ -123,6 +133,7 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
                 mocap=mocap,
                 arm=arm,
                 force=None,
+                team=team,
                 found_armed=True,
                 failures=tuple(failures),
             )
@@ -132,12 +143,17 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
         force = None
         if (sensor := _force(config, clock)) is not None:
             force = await stack.enter_async_context(sensor)
+        team = None
+        if (link := _team(config, clock)) is not None:
+            team = await stack.enter_async_context(link)
         ground = None
         if ground_address is not None:
             ground = await stack.enter_async_context(_ground(config, ground_address, autopilot))
         driver = _arm(config, clock)
         arm = await stack.enter_async_context(driver) if driver is not None else None
-        yield Devices(forwarder=forwarder, autopilot=autopilot, mocap=mocap, arm=arm, force=force, ground=ground)
+        yield Devices(
+            forwarder=forwarder, autopilot=autopilot, mocap=mocap, arm=arm, force=force, team=team, ground=ground
+        )
 
 
 @contextlib.asynccontextmanager
@@ -215,6 +231,12 @@ def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> M
     return MocapDriver(config.vehicle.devices.mocap, clock, on_pose)
 
 
+def _team(config: FlightConfig, clock: Clock) -> TeamLink | None:
+    """Return the link to the other vehicle, or None if the vehicle flies alone."""
+    device = config.vehicle.devices.team
+    return None if device is None else TeamLink(TeamSettings(**device.model_dump()), clock)
+
+
 def _ground(config: FlightConfig, address: str, autopilot: MavsdkAutopilot) -> GroundStation:
     ground = config.vehicle.ground
     return GroundStation(
@@ -232,12 +254,12 @@ def _autopilot(config: FlightConfig, clock: Clock) -> MavsdkAutopilot:
     return MavsdkAutopilot(devices.autopilot, clock, forwarding=forwarding, estimator_rate_hz=rate_hz)
 
 
-def open_arm(device: ArmDevice, arm: ArmConfig, clock: Clock) -> DynamixelArm | PluginArm:
-    """Return the driver of an arm, to be opened as a context manager."""
-    return (DynamixelArm if device.type == DYNAMIXEL else PluginArm)(device, arm, clock)
+def open_arm(device: ArmDevice, arm: ArmConfig, clock: Clock, jaws: Jaws | None = None) -> DynamixelArm | PluginArm:
+    """Return the driver of an arm and of its clamp, which only Dynamixel servos have, to be opened as a context manager."""
+    return DynamixelArm(device, arm, clock, jaws) if device.type == DYNAMIXEL else PluginArm(device, arm, clock)
 
 
 def _arm(config: FlightConfig, clock: Clock) -> DynamixelArm | PluginArm | None:
     """Return the driver of the arm, or None if the vehicle has none."""
     vehicle = config.vehicle
-    return open_arm(vehicle.arm_device, vehicle.arm, clock) if vehicle.arm.joints else None
+    return open_arm(vehicle.arm_device, vehicle.arm, clock, vehicle.jaws) if vehicle.arm.joints else None

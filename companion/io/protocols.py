@@ -15,12 +15,14 @@ from companion.model.markers import MarkerFrame
 from companion.model.observations import (
     ArmStatement,
     ForceCounts,
+    LinkCounts,
     MocapCounts,
     MocapServer,
     ServoReport,
     StateCounts,
 )
 from companion.model.outputs import Outputs
+from companion.model.team import BarPose, ClampCommand, ClampState, PartnerState, TeamState
 from companion.model.types import (
     ArmState,
     AttitudeSetpoint,
@@ -115,6 +117,9 @@ class Mocap(Device, Protocol):
     def markers(self) -> MarkerFrame | None:
         """Return the single markers of the newest frame, or None without `devices.mocap.ball`."""
 
+    def bar(self) -> BarPose | None:
+        """Return the bar's rigid body in the newest frame that had it, or None without `devices.mocap.bar_id`."""
+
     def counts(self) -> MocapCounts:
         """Return the numbers of frames since the device was opened."""
 
@@ -154,6 +159,12 @@ class Arm(Device, Protocol):
     def write_torque(self, torque_nm: Joints) -> Joints:
         """Command both joint torques, N m. Return the torques that are sent, clipped and rounded to counts."""
 
+    def clamp(self) -> ClampState | None:
+        """Return the newest state of the clamp, or None without one."""
+
+    def command_clamp(self, command: ClampCommand | None) -> None:
+        """Command the clamp, which keeps the last command; None commands nothing. Never waits."""
+
 
 class ForceTorque(Device, Protocol):
     """The force-torque sensor."""
@@ -170,6 +181,19 @@ class ForceTorque(Device, Protocol):
 
     def counts(self) -> ForceCounts:
         """Return the numbers of samples and invalid packets since the device was opened."""
+
+
+class Team(Device, Protocol):
+    """The link to the other vehicle of a team."""
+
+    def announce(self, said: TeamState) -> None:
+        """Send this vehicle's state; called in each tick. Never waits."""
+
+    def newest(self) -> PartnerState | None:
+        """Return the newest announcement of the other vehicle, or None before the first."""
+
+    def counts(self) -> LinkCounts:
+        """Return the numbers of announcements and of rejected datagrams since the link was opened."""
 
 
 class GroundLink(Device, Protocol):

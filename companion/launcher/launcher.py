@@ -100,12 +100,21 @@ class Launcher:
         sitl: autopilot of the simulated world; None for hardware.
         speed: simulated seconds in a second of real time at most, with SITL; None for a flight in real time.
         on_message: called with every message of the processes, for the display.
+        world: with SITL, the running world of several vehicles; None to start one.
     """
 
     def __init__(
-        self, config: SitlConfig, out: Path, *, sitl: Sitl | None, on_message: OnMessage, speed: float | None = None
+        self,
+        config: SitlConfig,
+        out: Path,
+        *,
+        sitl: Sitl | None,
+        on_message: OnMessage,
+        speed: float | None = None,
+        world: SitlProcess | None = None,
     ) -> None:
         self._speed = speed if sitl is not None else None
+        self._world = world
         self._time: SharedTime | None = None
         """Simulated time; None in real time."""
         self._flown_from: tuple[float, float] | None = None
@@ -121,6 +130,11 @@ class Launcher:
         self._guardian: GuardianProcess | None = None
         self._cpu_contention = CpuContention({})
 
+    @property
+    def flying(self) -> bool:
+        """Whether the flight process is ticking; False after the flight."""
+        return self._reports.flying
+
     def request_landing(self) -> None:
         """Request a landing (Ctrl-C); repeated requests change nothing."""
         self._stop_requested = True
@@ -135,14 +149,13 @@ class Launcher:
         Raises:
             LaunchError: a process of the flight could not be started.
         """
-        sitl: SitlProcess | None = None
+        sitl = self._world
         keep_off(self._config.vehicle.computer.cpus)
         try:
             config = self._config.flight
             if self._sitl is not None:
-                if self._speed is not None:
-                    self._time = SharedTime(self._speed)
-                sitl = SitlProcess(self._config, self._out, self._time, px4=self._sitl == "px4")
+                sitl = sitl or SitlProcess.start(self._config, self._out, self._speed, px4=self._sitl == "px4")
+                self._time = sitl.time
                 config = replace_device_settings(config, sitl.devices(self._on_message, lambda: self._stop_requested))
             path = self._out / "config.json"
             write_text(path, config.model_dump_json(indent=1))
@@ -155,13 +168,8 @@ class Launcher:
             # A child that has not left the terminal's process group yet receives the Ctrl-C, too.
             outcome = Outcome.ABORTED
         finally:
-            if self._time is not None:
-                for name in ("flight", "guardian"):  # a process that was never started is not waited for
-                    self._time.started(name)
             if sitl is not None:
                 sitl.stop()
-            if self._time is not None:
-                self._time.close()
         world = sitl.final if sitl is not None else {}
         if world.get("crashed") and outcome is not Outcome.REFUSED:
             outcome = Outcome.CRASHED
@@ -183,7 +191,7 @@ class Launcher:
         heartbeats_out, heartbeats_in = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         # Flight and guardian also keep the world's standard input open, so that the world runs until all have exited. If this process
         # is killed, the flight process can still land and see that it has landed.
-        shared = () if sitl is None or sitl.process.stdin is None else (sitl.process.stdin.fileno(),)
+        shared = () if sitl is None else (sitl.told.fileno(),)
         in_time, inherited = ((), ()) if self._time is None else self._time.of("flight")
         with ours, heartbeats_in:
             ours.setblocking(False)

@@ -59,7 +59,7 @@ def run_flight(
         for line in result.lines:
             print_error(line)
         try:
-            log, summary = _summary(config, result, out, speed)
+            log, summary = summary_of(config, result, out, speed)
         except OSError as error:
             print_error(f"{out}: summary.json cannot be written: {error.strerror}")
             return result.exit_code
@@ -79,10 +79,14 @@ def run_flight(
     return result.exit_code
 
 
-def _summary(
+def summary_of(
     config: SitlConfig, result: FlightResult, out: Path, speed: float | None
 ) -> tuple[FlightLog | None, dict[str, Any]]:
-    """Read the log if it exists, and write summary.json."""
+    """Read the log if it exists, write summary.json, and return both.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     log = None
     path = out / "flight.mcap"
     if path.exists():

@@ -58,11 +58,15 @@ class SharedTime:
         """Close the end of a process that was started, or that never will be."""
         self._channels[name][1].close()
 
+    def all_started(self) -> None:
+        """Close the ends of the processes that were never started."""
+        for name in _PROCESSES:
+            self.started(name)
+
     def close(self) -> None:
         """Close everything that is open."""
         self.world_started()
-        for name in _PROCESSES:
-            self.started(name)
+        self.all_started()
         with contextlib.suppress(OSError):
             os.close(self._page_fd)
         self._page_fd = -1

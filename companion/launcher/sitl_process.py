@@ -8,9 +8,9 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import IO, Any, Self, cast
 
 from companion.launcher.shared_time import SharedTime
 from companion.model.codec import RecordError, from_jsonable
@@ -30,45 +30,93 @@ SITL_TERMINATE_TIMEOUT_S = 10.0
 
 
 class SitlProcess:
-    """A running simulated world.
+    """A running simulated world, as the flight of one of its vehicles sees it; made by `start`.
 
     Args:
-        config: checked configuration.
-        out: folder of the flight.
-        shared_time: simulated time of the flight; None for a world in real time.
+        process: the process, which vehicles of one world share.
+        told: pipe on which the world hears about this flight.
+        said: pipe on which the world speaks about this vehicle.
+        log: the world's log.
         px4: whether the world flies a real PX4.
+        time: simulated time of the flight; None for a world in real time.
     """
 
     def __init__(
-        self, config: SitlConfig, out: Path, shared_time: SharedTime | None = None, *, px4: bool = False
+        self,
+        process: subprocess.Popen[bytes],
+        told: IO[bytes],
+        said: IO[bytes],
+        log: Path,
+        px4: bool,
+        time: SharedTime | None,
     ) -> None:
-        self._px4 = px4
+        self.process, self.told, self.log, self.time = process, told, log, time
+        self._said, self._px4 = said, px4
         self._error: str | None = None
-        path = out / "sitl_config.json"
-        write_text(path, config.model_dump_json(indent=1))
-        self.log = out / "sitl.log"
-        in_time, inherited = ((), ()) if shared_time is None else shared_time.of_world()
-        with open(self.log, "wb") as log:
-            self.process = subprocess.Popen(
-                [
-                    *(sys.executable, "-P", "-m", "sitl", "--config", str(path), "--for-launcher"),
-                    *(("--px4", str((out / PX4_FOLDER).resolve())) if px4 else ()),
-                    *in_time,
-                ],
+        self._lines = JsonLines(said.fileno())
+        self.final: dict[str, Any] = {}
+        self.at_rest = False
+        self.before_stop: Callable[[], None] = lambda: None
+        """Called first of all by `stop`: a flight waits for the other flights in the same world."""
+        self.flight_environment: dict[str, str] = {}
+        """Environment variables of the flight process with which the world injects faults into it."""
+
+    @classmethod
+    def start(cls, config: SitlConfig, out: Path, speed: float | None = None, *, px4: bool = False) -> Self:
+        """Start the world of one vehicle.
+
+        Args:
+            config: checked configuration.
+            out: folder of the flight.
+            speed: simulated seconds in a second of real time at most; None for a world in real time.
+            px4: whether the world flies a real PX4.
+
+        Raises:
+            LaunchError: the kernel gives no shared memory or no sockets.
+        """
+        return cls.start_all([(config, out)], speed, px4=px4)[0]
+
+    @classmethod
+    def start_all(
+        cls, members: Sequence[tuple[SitlConfig, Path]], speed: float | None = None, *, px4: bool = False
+    ) -> list[Self]:
+        """Start the world of several vehicles, each with a flight of its own; as `start`."""
+        times = [None if speed is None else SharedTime(speed) for _ in members]
+        arguments, inherited = [sys.executable, "-P", "-m", "sitl", "--for-launcher"], []
+        for config, out in members:
+            path = out / "sitl_config.json"
+            write_text(path, config.model_dump_json(indent=1))
+            arguments += ["--config", str(path)]
+        pipes = [(*os.pipe(), *os.pipe()) for _ in members]
+        for hears, _, _, speaks in pipes[1:]:
+            arguments += ["--channel", f"{hears},{speaks}"]
+            inherited += [hears, speaks]
+        for time_of in times:
+            if time_of is not None:
+                in_time, descriptors = time_of.of_world()
+                arguments += in_time
+                inherited += descriptors
+        out = members[0][1]
+        arguments += ["--px4", str((out / PX4_FOLDER).resolve())] if px4 else []
+        with open(out / "sitl.log", "wb") as log:
+            process = subprocess.Popen(
+                arguments,
                 pass_fds=inherited,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
+                stdin=pipes[0][0],
+                stdout=pipes[0][3],
                 stderr=log,
                 start_new_session=True,
             )
-        if shared_time is not None:
-            shared_time.world_started()
-        assert self.process.stdout is not None
-        self._lines = JsonLines(self.process.stdout.fileno())
-        self.final: dict[str, Any] = {}
-        self.at_rest = False
-        self.flight_environment: dict[str, str] = {}
-        """Environment variables of the flight process with which the world injects faults into it."""
+        for time_of in times:
+            if time_of is not None:
+                time_of.world_started()
+        ends: list[tuple[IO[bytes], IO[bytes]]] = []
+        for hears, tells, listens, speaks in pipes:
+            os.close(hears)
+            os.close(speaks)
+            ends.append((os.fdopen(tells, "wb", buffering=0), os.fdopen(listens, "rb", buffering=0)))
+        path = out / "sitl.log"
+        return [cls(process, *pair, path, px4, time_of) for pair, time_of in zip(ends, times, strict=True)]
 
     def devices(
         self,
@@ -141,9 +189,8 @@ class SitlProcess:
 
     def send_flight_pid(self, pid: int) -> None:
         """Send the id of the flight process to the world, which may have to kill or stop it."""
-        assert self.process.stdin is not None
         with contextlib.suppress(OSError):  # a world that has exited is detected elsewhere
-            os.write(self.process.stdin.fileno(), json.dumps({"type": "flight", "pid": pid}).encode() + b"\n")
+            os.write(self.told.fileno(), json.dumps({"type": "flight", "pid": pid}).encode() + b"\n")
 
     def wait_at_rest(self, deadline_s: float) -> None:
         """Wait until the world's rotors have stopped, at most until the deadline."""
@@ -155,16 +202,21 @@ class SitlProcess:
 
     def stop(self) -> None:
         """Ask the world to exit, read its last messages, then end it. Repeated calls do nothing."""
-        assert self.process.stdin is not None and self.process.stdout is not None
-        if self.process.stdout.closed:
+        if self._said.closed:
             return
+        if self.time is not None:
+            self.time.all_started()  # a process that was never started is not waited for
+        self.before_stop()
         with contextlib.suppress(OSError):
-            self.process.stdin.close()
+            self.told.close()
         self._read_for(SITL_EXIT_TIMEOUT_S)
         if not self.ended:
             self.process.terminate()
             self._read_for(SITL_TERMINATE_TIMEOUT_S)
         terminate(self.process)
+        self._said.close()
+        if self.time is not None:
+            self.time.close()
 
     def _read_for(self, timeout_s: float) -> None:
         for _ in self.messages(time.monotonic() + timeout_s):

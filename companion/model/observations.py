@@ -5,6 +5,7 @@ them.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import msgspec
 
@@ -97,6 +98,23 @@ class ForceCounts(Record, frozen=True, kw_only=True):
     bad_sums: int
     lost: str | None
     """Reason why the port is no longer being read; None if it still is."""
+
+
+class LinkCounts(NamedTuple):
+    """Announcements on the link of a team since it was opened."""
+
+    sent: int = 0
+    unsent: int = 0
+    """Announcements that the network did not take."""
+    received: int = 0
+    foreign: int = 0
+    """Datagrams from another address than the other vehicle's."""
+    malformed: int = 0
+    """Datagrams of another length or version, or with a state that is not one."""
+    forged: int = 0
+    """Datagrams with a wrong proof."""
+    repeated: int = 0
+    """Datagrams that are not newer than one before."""
 
 
 class MocapStream(Record, frozen=True, kw_only=True):

@@ -174,7 +174,7 @@ def _settings(servos: Sequence[ServoReport], vehicle: Vehicle) -> Iterator[Row]:
 
 
 def _bus_time(vehicle: Vehicle, servos: Sequence[ServoReport]) -> Row:
-    count, baud = len(vehicle.arm.joints), vehicle.arm_device.baud
+    count, baud = len(vehicle.arm.joints) + (vehicle.jaws is not None), vehicle.arm_device.baud
     takes_s = cycle_s(count, baud) + 1e-6 * sum(servo.return_delay_us for servo in servos)
     read = f"{takes_s * 1e3:.2g} ms ({count} servos, {cycle_bytes(count)} bytes at {baud} baud)"
     wanted = f"at most {CYCLE_MAX_S * 1e3:g} ms"

@@ -88,7 +88,14 @@ BALL = Check(
     "nothing is followed: the mission waits, and goes on without a catch",
     warns=True,
 )
-CHECKS = (DEVICE, RATE, JITTER, LATENCY, LOST, TRACKED, FROZEN, BODY, ERROR, CLOCK, BALL)
+BAR = Check(
+    "mocap.bar",
+    "bar's rigid body",
+    "with `devices.mocap.bar_id`: the bar's rigid body in the stream",
+    "the bar is taken to stand exactly at its place in the mission",
+    warns=True,
+)
+CHECKS = (DEVICE, RATE, JITTER, LATENCY, LOST, TRACKED, FROZEN, BODY, ERROR, CLOCK, BALL, BAR)
 
 RATE_GOOD = 0.9
 GAP_GOOD_S = 0.05
@@ -122,6 +129,8 @@ def rows(o: Observations, vehicle: Vehicle) -> Iterator[Row]:
     yield _clock(o.mocap, vehicle)
     if vehicle.devices.mocap.ball is not None:
         yield _ball(o.markers, stream, vehicle.devices.mocap.ball, vehicle)
+    if vehicle.devices.mocap.bar_id is not None:
+        yield _bar(stream, vehicle.devices.mocap.bar_id)
 
 
 def _rate(o: Observations, stream: MocapStream, vehicle: Vehicle) -> Row:
@@ -177,8 +186,9 @@ def _frozen(poses: tuple[MocapPose, ...]) -> Row:
 
 
 def _body(stream: MocapStream, vehicle: Vehicle) -> Row:
-    number, ball = vehicle.devices.mocap.rigid_body_id, vehicle.devices.mocap.ball
-    others = tuple(one for one in stream.other_bodies if ball is None or one != ball.id)
+    mocap = vehicle.devices.mocap
+    number, known = mocap.rigid_body_id, (mocap.ball and mocap.ball.id, mocap.bar_id)
+    others = tuple(one for one in stream.other_bodies if one not in known)
     name = f' "{stream.body_name}"' if stream.body_name else ""
     if not others:
         return BODY.good(f"id {number}{name}, no other", f"id {number}")
@@ -191,9 +201,8 @@ def _ball(frames: tuple[MarkerFrame, ...], stream: MocapStream, ball: TrackedBal
     if ball.id is not None:
         share = sum(bool(frame.markers) for frame in frames) / max(1, len(frames))
         if ball.id not in stream.other_bodies:
-            streamed = ", ".join(map(str, stream.other_bodies)) or "none"
             fix = "create it in Motive from the ball's markers, or set devices.mocap.ball.id to its streaming id"
-            return BALL.bad(f"no rigid body {ball.id}; other bodies: {streamed}", f"body {ball.id}", fix)
+            return BALL.bad(_without(stream, ball.id), f"body {ball.id}", fix)
         return BALL.row(
             share > 0.0, f"body {ball.id}, in {share:.0%} of the frames", "tracked", "show the ball to the cameras"
         )
@@ -206,6 +215,17 @@ def _ball(frames: tuple[MarkerFrame, ...], stream: MocapStream, ball: TrackedBal
     return BALL.row(
         max(inside) <= 1, read, "at most the ball", "cover or mask what reflects in the room, such as other markers"
     )
+
+
+def _bar(stream: MocapStream, bar_id: int) -> Row:
+    if bar_id in stream.other_bodies:
+        return BAR.good(f"body {bar_id}", f"body {bar_id}")
+    fix = "create it in Motive from the bar's markers, or set devices.mocap.bar_id to its streaming id"
+    return BAR.bad(_without(stream, bar_id), f"body {bar_id}", fix)
+
+
+def _without(stream: MocapStream, body_id: int) -> str:
+    return f"no rigid body {body_id}; other bodies: {', '.join(map(str, stream.other_bodies)) or 'none'}"
 
 
 def _in_room(position_m: Vec3, room: Room) -> bool:

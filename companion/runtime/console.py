@@ -76,6 +76,23 @@ class _PlainNumbers(SteadyStream):
         return super().write(without_negative_zero(text))
 
 
+class _Prefixed(_PlainNumbers):
+    """Stream that begins each line with a word, without a terminal's codes."""
+
+    def __init__(self, stream: TextIO, prefix: str) -> None:
+        super().__init__(stream)
+        self._prefix = prefix
+
+    def write(self, text: str) -> int:
+        """Write whole lines."""
+        return super().write("".join(f"{self._prefix}{line}" for line in text.splitlines(keepends=True)))
+
+
+def prefixed_console(prefix: str) -> Console:
+    """Return a console on standard output whose lines begin with a word, for one of several flights."""
+    return Console(file=cast("IO[str]", _Prefixed(sys.stdout, prefix)), force_terminal=False)
+
+
 def console_on(stream: TextIO) -> Console:
     """Return a console on a stream whose reader may disappear."""
     return Console(file=cast("IO[str]", _PlainNumbers(stream)))
@@ -308,3 +325,31 @@ def print_result(
     if outcome != "refused":
         console.print()
         console.print(table, highlight=False)
+
+
+def print_team_result(console: Console, outcome: str, summary: dict[str, Any], out: Path) -> None:
+    """Print the result of two vehicles that carry a bar.
+
+    Args:
+        console: where to print.
+        outcome: the worse outcome of both.
+        summary: `team`, with the figures of the bar, and `members`, with the summary of each.
+        out: folder of the flight.
+    """
+    facts = Table.grid(padding=(0, 2))
+    facts.add_row("outcome", f"[{_OUTCOME_STYLE.get(outcome, 'bold red')}]{outcome}[/]")
+    for end, member in summary["members"].items():
+        error_m = (member["rms"].get("pre") or {}).get("e_p_m")
+        facts.add_row(end, member["outcome"] + ("" if error_m is None else f", position error {error_m:.4f} m RMS"))
+    team = summary["team"]
+    for name, key, unit in (
+        ("bar, position error", "bar_p_rms_m", "m RMS"),
+        ("bar, tilt", "bar_tilt_rms_deg", "deg RMS"),
+        ("internal force", "internal_force_rms_n", "N RMS"),
+        ("left vehicle's share", "share", "of the weight"),
+        ("let go", "let_go", "m above its stand"),
+    ):
+        facts.add_row(name, "-" if team[key] is None else f"{team[key]:.3f} {unit}")
+    facts.add_row("files", str(out))
+    console.print()
+    console.print(facts, highlight=False, soft_wrap=True)

@@ -1,4 +1,7 @@
-"""Removes records with a non-finite or out-of-range value: they count as not received, and the `*_not_finite` rules report them."""
+"""Removes records with a non-finite or out-of-range value: they count as not received, and the `*_not_finite` rules report them.
+
+There is no such rule for the clamp, the bar and the other vehicle, whose drivers reject such values.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from typing import Any, Final
 import msgspec
 
 from companion.model.listing import listed
+from companion.model.team import BarPose, ClampState, PartnerState
 from companion.model.types import ArmState, AutopilotStatus, ForceSample, Inputs, MocapPose, Quat, Vec3, VehicleState
 from companion.safety.flight_context import Values
 
@@ -26,6 +30,9 @@ class InputFilter:
         self._mocap: MocapPose | None = None
         self._arm: ArmState | None = None
         self._force: ForceSample | None = None
+        self._clamp: ClampState | None = None
+        self._bar: BarPose | None = None
+        self._partner: PartnerState | None = None
         self.invalid: dict[str, Any] = {}
         """Invalid records of this tick, by field of `Inputs`."""
 
@@ -58,6 +65,22 @@ class InputFilter:
                 self._status = status
             else:
                 invalid["status"] = status
+        clamp, bar, partner = i.clamp, i.bar, i.partner
+        if clamp is not None and clamp is not self._clamp:
+            if _stamp(clamp.stamp_s) and -OUT_OF_RANGE < clamp.angle_rad < OUT_OF_RANGE:
+                self._clamp = clamp
+            else:
+                invalid["clamp"] = clamp
+        if bar is not None and bar is not self._bar:
+            if _bar_is_valid(bar):
+                self._bar = bar
+            else:
+                invalid["bar"] = bar
+        if partner is not None and partner is not self._partner:
+            if _partner_is_valid(partner):
+                self._partner = partner
+            else:
+                invalid["partner"] = partner
         self.invalid = invalid
         return msgspec.structs.replace(i, **dict.fromkeys(invalid)) if invalid else i
 
@@ -133,6 +156,16 @@ def _mocap_is_valid(m: MocapPose) -> bool:
         # Motive may send any values for an untracked body; its pose is not used.
         and (not m.tracking_valid or (_in_range3(m.position_world_m) and _is_rotation(m.attitude_wxyz)))
     )
+
+
+def _bar_is_valid(b: BarPose) -> bool:
+    seen = not b.tracking_valid or (_in_range3(b.position_world_m) and _is_rotation(b.attitude_wxyz))
+    return _stamp(b.stamp_s) and seen
+
+
+def _partner_is_valid(p: PartnerState) -> bool:
+    lift_s = p.said.lift_server_s
+    return _stamp(p.stamp_s) and (lift_s is None or _stamp(lift_s)) and _in_range3(p.said.position_world_m)
 
 
 def _arm_is_valid(a: ArmState) -> bool:

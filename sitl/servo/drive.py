@@ -80,7 +80,8 @@ class ServoDrive:
         self.now_s = self._current = self._heard_s = 0.0
         self.slip_counts = 0
         self._updated = False
-        self.set_goal_current(0, at_once=True)
+        if self.mode == MODE_CURRENT:
+            self.set_goal_current(0, at_once=True)
         self.start_watchdog(self._watchdog_s)
 
     def update(self, t_s: float, shaft_angle_rad: float, shaft_velocity_rad_s: float) -> float:

@@ -15,7 +15,7 @@ from companion.campaigns.faults.sitl_flights import flown as flown_over_wires
 from companion.campaigns.faults.variants import CONTACT, VARIANTS, Variant, planned
 from companion.cli.main import main
 from companion.launcher.launcher import FlightResult
-from companion.launcher.run import _summary
+from companion.launcher.run import summary_of
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.model.types import (
     Event,
@@ -239,7 +239,7 @@ def test_what_a_dead_recorder_did_not_log_is_in_the_summary_all_the_same(tmp_pat
         "action": "warn",
         "text": "x",
     }
-    _, made = _summary(load_sitl(CATCH), FlightResult(Outcome.COMPLETED, events=(told,)), tmp_path, None)
+    _, made = summary_of(load_sitl(CATCH), FlightResult(Outcome.COMPLETED, events=(told,)), tmp_path, None)
     assert made["events"] == [told]
 
 

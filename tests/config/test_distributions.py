@@ -23,7 +23,8 @@ from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import World
 from sitl.campaigns.flights import with_world
 from sitl.fast.loop import FastFlight
-from sitl.server import Ports, Sitl
+from sitl.server import Sitl
+from sitl.wires import MachineWires, Ports
 from sitl.world.model import base_mass_kg, link_masses_kg
 from sitl.world.start import start_of
 from tests.support import HOVER, tool_of
@@ -247,9 +248,9 @@ def test_a_model_error_without_the_section_machine_changes_nothing_else_of_the_m
 def test_both_loops_fly_the_machine_with_the_model_error() -> None:
     config = load_sitl(HOVER, overrides=["world.model_error=0.2"])
     true, believed = (FastFlight(c).plant.machine.weight_n for c in (config, load_sitl(HOVER)))
-    plant = Sitl(
-        config.vehicle, config.world, start_of((0.0, 0.0), 0.0, (90.0, 90.0)), Ports(), lambda message: None
-    ).plant
+    start = start_of((0.0, 0.0), 0.0, (90.0, 90.0))
+    wires = MachineWires(config.vehicle, config.world, start, Ports(), lambda message: None)
+    plant = Sitl([wires]).machines[0].plant
     assert plant.machine.weight_n == true
     tool, errs = tool_of(config.vehicle), with_model_error(config.world, 2)
     links_kg = link_masses_kg(config.vehicle, errs)

@@ -26,6 +26,7 @@ from companion.model.observations import (
     ServoReport,
     StateCounts,
 )
+from companion.model.team import BarPose, ClampCommand, ClampState
 from companion.model.types import (
     IDENTITY_QUAT,
     ArmState,
@@ -155,6 +156,9 @@ class OtherMocap(Standing):
     def markers(self) -> MarkerFrame | None:
         return None
 
+    def bar(self) -> BarPose | None:
+        return None
+
     def latest(self) -> MocapPose | None:
         self.frame += 1
         # No measurement is the same twice: the core would take it for a frozen stream.
@@ -174,6 +178,12 @@ class OtherArm(Standing):
     servos: tuple[ServoReport, ...] = ()
     statement: ArmStatement | None = None
     read_takes_s = 0.001
+
+    def clamp(self) -> ClampState | None:
+        return None
+
+    def command_clamp(self, command: ClampCommand | None) -> None:
+        pass
 
     def latest(self) -> ArmState | None:
         return ArmState(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import dataclasses
 import json
 import os
 import socket
@@ -21,6 +22,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.config.loader import load_flight
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
+from companion.io.team_link import TeamSettings
 from companion.launcher.launcher import replace_device_settings
 from companion.model.codec import from_packet
 from companion.model.frames import attitude_ned_frd_from_enu_flu, ned_from_enu
@@ -96,8 +98,15 @@ class Rig:
     """One guardian with its surroundings; used with `with`, which starts it and ends its processes."""
 
     def __init__(
-        self, folder: Path, *, timeout_s: float = PATIENT_S, disk_full: bool = False, address: str | None = None
+        self,
+        folder: Path,
+        *,
+        timeout_s: float = PATIENT_S,
+        disk_full: bool = False,
+        address: str | None = None,
+        team: TeamSettings | None = None,
     ) -> None:
+        self._team = team
         self._folder = folder
         self._address = address
         self._timeout_s = timeout_s
@@ -128,6 +137,8 @@ class Rig:
         }
         data = json.loads(replace_device_settings(config, devices).model_dump_json())
         data["vehicle"]["safety"]["guardian_timeout_s"] = self._timeout_s
+        if self._team is not None:
+            data["vehicle"]["devices"]["team"] = dataclasses.asdict(self._team)
         path = self._folder / "config.json"
         path.write_text(json.dumps(data), encoding="utf-8")
 

@@ -252,7 +252,7 @@ def test_each_message_of_the_guardian_says_that_it_has_taken_over(message: Messa
 
 def test_a_world_that_does_not_leave_is_heard_to_its_last_word(tmp_path: Path) -> None:
     # Armed, it would stay until its rotors stand: longer than the launcher waits.
-    world = SitlProcess(load_sitl(HOVER), tmp_path)
+    world = SitlProcess.start(load_sitl(HOVER), tmp_path)
     try:
         address = world.devices()["autopilot"]["address"].removeprefix("udpout://")
         with closing(mavutil.mavlink_connection(f"udpout:{address}", source_system=255)) as ground:

@@ -36,9 +36,10 @@ from companion.sitl_config.loader import load_sitl
 from companion.testing import check_arm
 from companion.testing.devices import _cycles, _refuse
 from sitl.fast.loop import FastFlight
-from sitl.server import Ports, Sitl
+from sitl.server import Sitl
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
+from sitl.wires import MachineWires, Ports
 from sitl.world.start import start_of
 from tests.plugins.arms import NAMES, SCRIPTED, ODrives
 from tests.plugins.installed import on_path, write_distribution
@@ -389,10 +390,16 @@ def test_a_log_is_read_without_the_arm(tmp_path: Path) -> None:
 def test_the_simulated_world_has_servos_with_the_torque_of_the_motors(tmp_path: Path) -> None:
     vehicle = load_flight("hover", vehicle_file(tmp_path, "type: moteus")).vehicle
     messages: list[WorldMessage] = []
-    server = Sitl(vehicle, load_sitl("hover").world, start_of((0.0, 0.0), 0.0, (0.0, 0.0)), Ports(), messages.append)
+    server = Sitl(
+        [
+            MachineWires(
+                vehicle, load_sitl("hover").world, start_of((0.0, 0.0), 0.0, (0.0, 0.0)), Ports(), messages.append
+            )
+        ]
+    )
 
     async def served() -> None:
-        async with server.wires() as devices:
+        async with server.wires() as (devices,):
             assert devices["arm"].items() >= {"type": "dynamixel", "options": {}}.items()
 
     asyncio.run(served())

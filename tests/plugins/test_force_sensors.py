@@ -30,7 +30,8 @@ from companion.runtime.clock import flight_clock
 from companion.sitl_config.world import World
 from companion.testing import check_force_sensor
 from sitl.force_torque import ForceTorqueServer
-from sitl.server import Ports, Sitl
+from sitl.server import Sitl
+from sitl.wires import MachineWires, Ports
 from sitl.world.start import start_of
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import ROOT
@@ -372,10 +373,10 @@ def test_the_simulated_world_has_the_built_in_devices_and_says_so() -> None:
     ]
     vehicle = load_flight("hover", overrides=settings).vehicle
     messages: list[WorldMessage] = []
-    server = Sitl(vehicle, World(), start_of((0.0, 0.0), 0.0, (0.0, 0.0)), Ports(), messages.append)
+    server = Sitl([MachineWires(vehicle, World(), start_of((0.0, 0.0), 0.0, (0.0, 0.0)), Ports(), messages.append)])
 
     async def served() -> dict[str, dict[str, Any]]:
-        async with server.wires() as devices:
+        async with server.wires() as (devices,):
             return devices
 
     devices = asyncio.run(served())

@@ -45,6 +45,7 @@ class Case:
 FED: dict[str, Any] = {"mocap": (), "mocap_stream": None}
 EXTERNAL = {"devices.mocap.type": "external"}
 WITH_MARKER: dict[str, Any] = {"devices.mocap.ball": {"kind": "marker"}}
+WITH_BAR: dict[str, Any] = {"devices.mocap.bar_id": 3}
 WITH_BODY: dict[str, Any] = {"devices.mocap.ball": {"kind": "body", "id": 9}}
 
 
@@ -200,6 +201,9 @@ CASES = {
         "mocap.ball", "no rigid body 9; other bodies: 2", "devices.mocap.ball.id",
         {"mocap_stream": r.stream(other_bodies=(2,))}, WARN, WITH_BODY, (),
     ),
+    "bar that is not there": Case(
+        "mocap.bar", "no rigid body 3; other bodies: none", "devices.mocap.bar_id", {}, WARN, WITH_BAR,
+    ),
     "ball out of sight": Case(
         "mocap.ball", "in 0% of the frames", "show the ball",
         {"mocap_stream": r.stream(other_bodies=(9,)), **markers()}, WARN, WITH_BODY,
@@ -317,7 +321,7 @@ def failed(rows: Mapping[str, Row]) -> set[str]:
 def test_a_sound_machine_passes_every_row() -> None:
     rows = {row.id: row for row in evaluation.rows(r.sound(), r.config())}
     assert not failed(rows), [row.line() for row in rows.values() if not row.ok]
-    assert set(rows) >= {check.id for check in evaluation.CHECKS} - {frames.HAND_TEST.id, mocap.BALL.id}
+    assert set(rows) >= {check.id for check in evaluation.CHECKS} - {frames.HAND_TEST.id, mocap.BALL.id, mocap.BAR.id}
     assert all(row.read and row.why and not row.fix for row in rows.values())
     assert evaluation.unsettled(r.sound(), r.config()) is None
 
@@ -418,6 +422,11 @@ def test_a_ball_that_is_shown_to_the_cameras_passes(ball: Mapping[str, Any], see
         )
     )
     assert rows["mocap.ball"].ok and rows["mocap.body"].ok
+
+
+def test_a_bar_in_the_stream_passes_and_is_not_taken_for_another_body() -> None:
+    rows = judged(Case("", "", "", {"mocap_stream": r.stream(other_bodies=(3,))}, vehicle=WITH_BAR))
+    assert rows["mocap.bar"].ok and rows["mocap.body"].ok
 
 
 def test_observations_of_nothing_refuse_and_do_not_fall_over() -> None:

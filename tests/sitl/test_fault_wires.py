@@ -17,7 +17,8 @@ from sitl.autopilot.mavlink import Ports as LinkPorts
 from sitl.fast.link import FastLink
 from sitl.fast.loop import FastFlight
 from sitl.faults.processes import OTHER_PROCESS_FAULTS
-from sitl.server import Ports, Sitl
+from sitl.server import Sitl
+from sitl.wires import MachineWires, Ports
 from sitl.world.start import start_of
 from tests.support import CATCH
 
@@ -38,15 +39,18 @@ def test_the_server_begins_and_ends_each_fault_of_a_wire_or_a_process(monkeypatc
     faults = [{**common, "kind": kind, "size": sizes.get(kind)} for kind in (*kinds, *OTHER_PROCESS_FAULTS)]
     config = load_sitl(CATCH, overrides=[f"world.faults={json.dumps([*faults, {**common, 'kind': 'stop_flight'}])}"])
     px4 = StubBackend(config.vehicle.airframe, config.world, LinkPorts(0, 0))
-    server = Sitl(config.vehicle, config.world, start_of((0.0, 0.0), 0.0, (20.0, 20.0)), Ports(), lambda _: None, px4)
+    wires = MachineWires(
+        config.vehicle, config.world, start_of((0.0, 0.0), 0.0, (20.0, 20.0)), Ports(), lambda _: None, px4
+    )
+    server = Sitl([wires])
 
     def seen() -> tuple[object, ...]:
-        link, bus, sensor = px4._mavlink, server.bus, server.force
+        link, bus, sensor = px4._mavlink, wires.bus, wires.force
         assert bus is not None and sensor is not None
-        silent = server.servos[0].silent
+        silent = wires.servos[0].silent
         return (
             *(link.link_down, link.delay_s, bus.damaged(), bus.answers_late_s, sensor.silent, silent),
-            server.faults.server_clock_s(server.plant.t_s),
+            wires.faults.server_clock_s(wires.plant.t_s),
         )
 
     async def run() -> None:
@@ -56,18 +60,18 @@ def test_the_server_begins_and_ends_each_fault_of_a_wire_or_a_process(monkeypatc
                 (0.02, (True, 0.05, True, 0.02, True, True, 5.02)),
                 (0.04, (False, 0.0, False, 0.0, False, False, 0.04)),
             ):
-                while server.plant.t_s < until_s - 0.0015:
+                while wires.plant.t_s < until_s - 0.0015:
                     server._step()
                 assert seen() == pytest.approx(found), until_s
 
     with subprocess.Popen(["sleep", "600"]) as process:
         try:
-            server.flight.pid = process.pid
+            wires.flight.pid = process.pid
             asyncio.run(run())
         finally:
             process.kill()
     assert struck == list(OTHER_PROCESS_FAULTS)
-    assert server.flight.kind == "stop_flight"
+    assert wires.flight.kind == "stop_flight"
 
 
 # -- the link of the fast loop -----------------------------------------------------------------------------------------

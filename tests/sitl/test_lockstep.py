@@ -16,7 +16,7 @@ import pytest
 from companion.runtime.event_loop import SimulatedLoop
 from companion.runtime.simulated_time import Descriptors, Page, SimulatedTime
 from sitl import lockstep
-from sitl.lockstep import TimeKeeper
+from sitl.lockstep import MachineTime, TimeKeeper
 from tests.support import DEADLINE_S
 
 
@@ -26,7 +26,7 @@ class Pair:
     def __init__(self, speed: float = float("inf")) -> None:
         page = Page.create()
         world, process = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.keeper = TimeKeeper(Page(page), {"flight": world}, speed)
+        self.keeper = TimeKeeper([MachineTime(Page(page), {"flight": world})], speed)
         self.process = SimulatedTime(Descriptors(page, process.detach()))
         self.world = world
         os.close(page)
@@ -65,7 +65,7 @@ def at_work(pair: Pair, wake_s: float, *, first: Callable[[], None] = lambda: No
 
 
 def advance(pair: Pair, now_s: float, *, data: bool = False) -> None:
-    pair.keeper.processes["flight"].read()
+    pair.keeper.machines[0].processes["flight"].read()
     asyncio.run(pair.keeper.advance(now_s, data))
 
 
@@ -105,11 +105,11 @@ def test_a_hung_process_is_ignored_until_it_reports_again(pair: Pair, monkeypatc
     monkeypatch.setattr(lockstep, "PATIENCE_S", 0.05)
     pair.report(0.0)
     advance(pair, 0.0)
-    assert not pair.keeper.processes["flight"].waited_for
+    assert not pair.keeper.machines[0].processes["flight"].waited_for
     pair.report(5.0)
     with at_work(pair, 9.0) as worked:
         advance(pair, 4.0)
-        assert pair.keeper.processes["flight"].waited_for
+        assert pair.keeper.machines[0].processes["flight"].waited_for
         advance(pair, 5.0)
         assert worked == [5.0]
 
@@ -120,7 +120,7 @@ def test_a_process_that_ends_is_not_waited_for(pair: Pair) -> None:
     ends.start()
     advance(pair, 0.002)
     ends.join()
-    assert pair.keeper.processes["flight"].ended
+    assert pair.keeper.machines[0].processes["flight"].ended
 
 
 def test_without_a_world_time_follows_the_computers_clock(pair: Pair) -> None:
@@ -148,11 +148,11 @@ def test_timers_of_the_event_loop_follow_simulated_time(pair: Pair) -> None:
 
     def world() -> None:
         """Grant the process the instant of its timer, once it has reported it."""
-        flight = pair.keeper.processes["flight"]
+        flight = pair.keeper.machines[0].processes["flight"]
         while not flight.wants(101.0, data=False):
             select.select([flight], [], [])
             flight.read()
-        pair.keeper.page.now_s = 101.0
+        pair.keeper.machines[0].page.now_s = 101.0
         flight.grant()
 
     loop.run_in_executor(None, world)

@@ -12,12 +12,14 @@ from companion.commissioning.arm.bus import ServoTalk
 from companion.commissioning.arm.servo import (
     SETTINGS,
     Assignment,
+    ClampJoint,
     FoundServo,
     Scan,
     assign,
     expected_models,
     is_strange,
     settings,
+    with_clamp,
 )
 from companion.commissioning.tool import Session
 from companion.config.arm import Arm
@@ -118,7 +120,7 @@ def _read(talk: ServoTalk, servo_id: int, model: int, firmware: int) -> FoundSer
 
 def judge(found: Scan, vehicle: Vehicle) -> Judgement:
     """Compare a scan with the vehicle file."""
-    arm, device = vehicle.arm, vehicle.arm_device
+    arm, device = with_clamp(vehicle), vehicle.arm_device
     who = assign(found.servos, arm)
     present = [(index, servo) for index, servo in enumerate(who.joints) if servo is not None]
     rows = [_collision(found, arm), _ids(found, who, arm), *_models(found, arm), *_bauds(found, device)]
@@ -127,13 +129,16 @@ def judge(found: Scan, vehicle: Vehicle) -> Judgement:
     for index, servo in present:
         rows += _settings(index, servo, arm, device)
     rows.append(preflight.usb_latency(USB, found.latency_ms))
-    return Judgement(tuple(rows), who, {} if found.garbled_at else _changes(who, device))
+    return Judgement(tuple(rows), who, {} if found.garbled_at else _changes(who, arm, device))
 
 
-def _changes(who: Assignment, device: ArmDevice) -> dict[Location, Data]:
+def _changes(who: Assignment, arm: Arm, device: ArmDevice) -> dict[Location, Data]:
     changes: dict[Location, Data] = {}
-    if who.renamed is not None and (servo := who.joints[who.renamed]):
-        changes["arm", "joints", who.renamed, "servo_id"] = servo.servo_id
+    servo = None if who.renamed is None else who.joints[who.renamed]
+    if who.renamed is not None and servo and servo.servo_id not in [joint.servo_id for joint in arm.joints]:
+        clamp = isinstance(arm.joints[who.renamed], ClampJoint)
+        key: Location = ("tool", "jaws") if clamp else ("arm", "joints", who.renamed)
+        changes[*key, "servo_id"] = servo.servo_id
     bauds = {servo.baud if servo else 0 for servo in who.joints}
     if len(bauds) == 1 and device.baud not in bauds and min(bauds) >= bus.FACTORY_BAUD:
         changes["devices", "arm", "baud"] = bauds.pop()

@@ -11,9 +11,10 @@ from companion.commissioning.arm import bus
 from companion.config.arm import Arm, Joint
 from companion.config.devices import ArmDevice
 from companion.config.document import ConfigError
+from companion.config.vehicle import Vehicle
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import Register
-from companion.model.servos import COUNTS_PER_TURN, ServoKind, kind_of
+from companion.model.servos import COUNTS_PER_TURN, SERVOS, ServoKind, kind_of
 from companion.preflight.arm import mode_text
 
 SETTINGS: Final = (
@@ -25,6 +26,28 @@ SETTINGS: Final = (
 """Registers that are read from every servo."""
 CURRENT_RESERVE: Final = 1.1
 _DRIVE_REVERSE: Final = 1
+
+
+class ClampJoint(Joint):
+    """The clamp's servo, which is set up as if it were that of a further joint, but for its operating mode."""
+
+
+def with_clamp(vehicle: Vehicle) -> Arm:
+    """Return the arm, with the clamp's servo as its last joint."""
+    arm, jaws = vehicle.arm, vehicle.jaws
+    if jaws is None:
+        return arm
+    kind = SERVOS[jaws.servo]
+    clamp = ClampJoint(
+        servo=jaws.servo,
+        servo_id=jaws.servo_id,
+        sign=1,
+        zero_count=0,
+        angle_deg=(min(jaws.open_deg, jaws.closed_deg), max(jaws.open_deg, jaws.closed_deg)),
+        torque_max_nm=min(jaws.current_a, kind.stall_current_a) * kind.torque_per_amp_nm_a,
+        torque_per_amp_nm_a=kind.torque_per_amp_nm_a,
+    )
+    return arm.model_copy(update={"joints": (*arm.joints, clamp)})
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,10 +147,12 @@ def settings(servo: FoundServo, index: int, arm: Arm, device: ArmDevice) -> list
     needed = math.floor(joint.torque_max_nm / (arm.torque_constants_nm_a[index] * kind.current_unit_a) + 1e-9)
     limit = servo.value(dxl.CURRENT_LIMIT)
     wanted_limit = limit if limit >= needed else min(kind.current_limit_max_counts, math.ceil(CURRENT_RESERVE * needed))
-    delay = dxl.RETURN_DELAY_UNIT_US
+    delay, mode = dxl.RETURN_DELAY_UNIT_US, (dxl.MODE_CURRENT, "the companion commands currents")
+    if isinstance(joint, ClampJoint):
+        mode = dxl.MODE_CURRENT_POSITION, "a clamp holds its angle by itself"
     rows: list[tuple[Register, int, Callable[[int], str], str]] = [
         (dxl.RETURN_DELAY, 0, lambda v: f"{v * delay} us", "the factory setting of 500 us per servo takes a fifth of a control tick"),
-        (dxl.OPERATING_MODE, dxl.MODE_CURRENT, mode_text, "the companion commands currents"),
+        (dxl.OPERATING_MODE, mode[0], mode_text, mode[1]),
         *((register, wanted, _SHOWN.get(register, str), why) for register, wanted, why in dxl.REQUIRED),
         (dxl.CURRENT_LIMIT, wanted_limit, str, f"torque_max_nm {joint.torque_max_nm:g} needs {needed}"),
         (bus.MIN_POSITION_LIMIT, 0, str, "the companion itself enforces the joint limits"),

@@ -26,6 +26,7 @@ from companion.commissioning.arm.servo import (
     is_strange,
     joint_in,
     settings,
+    with_clamp,
 )
 from companion.commissioning.tool import Cancelled, Report, Session
 from companion.config.arm import Arm
@@ -198,14 +199,15 @@ def set_up(session: Session) -> Done:
         DeviceError: a servo no longer answers; scan again.
         Cancelled: the user declined to write.
     """
-    joint, arguments = joint_in(session.vehicle.arm, session.arguments.joint), session.arguments
+    arm, arguments = with_clamp(session.vehicle), session.arguments
+    joint = joint_in(arm, arguments.joint)
     session.say("setup: torque stays off; the changes are shown before they are written", "bold")
     wanted = _plan(session, joint)
     at_terminal = sys.stdin is not None and sys.stdin.isatty() and not arguments.yes and not arguments.json
     if not (wanted.one_at_a_time and joint is None and at_terminal):
         return _set_up(session, wanted)
     session.say(wanted.refusal, "yellow")
-    alone = [(index, f"only the servo of joint {index + 1}") for index in range(len(session.vehicle.arm.joints))]
+    alone = [(index, f"only the servo of joint {index + 1}") for index in range(len(arm.joints))]
     for joint, which in (*alone, (None, "all servos")):
         session.say(f"connect {which}, then press Enter", "bold")
         if not sys.stdin.readline():
@@ -217,7 +219,7 @@ def set_up(session: Session) -> Done:
 
 
 def _plan(session: Session, joint: int | None) -> SetupPlan:
-    return plan(scan_for(session), session.vehicle.arm, session.vehicle.arm_device, joint)
+    return plan(scan_for(session), with_clamp(session.vehicle), session.vehicle.arm_device, joint)
 
 
 def _set_up(session: Session, wanted: SetupPlan) -> Done:
@@ -227,7 +229,7 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
     needed = [one for one in wanted.servos if one.needed]
     _show(session, wanted.servos)
     for index in wanted.absent:
-        servo_id = vehicle.arm.joints[index].servo_id
+        servo_id = with_clamp(vehicle).joints[index].servo_id
         session.say(f"servo {servo_id} (joint {index + 1}) does not answer: check its power and cable", "bold red")
     if not needed:
         text = "nothing to write: every servo that answers has the required settings"
@@ -248,7 +250,7 @@ def _set_up(session: Session, wanted: SetupPlan) -> Done:
 
 def _left(vehicle: Vehicle, wanted: SetupPlan) -> list[str]:
     """Scan again and return the settings that differ, one line each."""
-    arm, device = vehicle.arm, vehicle.arm_device
+    arm, device = with_clamp(vehicle), vehicle.arm_device
     servos = {servo.servo_id: servo for servo in scan(device, only=device.baud).servos if servo.registers}
     lines: list[str] = []
     for one in wanted.servos:

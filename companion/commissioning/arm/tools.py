@@ -14,7 +14,7 @@ from companion.commissioning.arm.drive import Driven, Leader, drive
 from companion.commissioning.arm.friction import Estimate, fit
 from companion.commissioning.arm.jog import ByKeys
 from companion.commissioning.arm.motion import LOAD_NM, SPEED_MAX_DEG_S, TORQUE_SHARE, limits_deg
-from companion.commissioning.arm.servo import Scan, joint_in
+from companion.commissioning.arm.servo import Scan, joint_in, with_clamp
 from companion.commissioning.arm.sweep import Leg, Sample, Sweeper, duration_s, legs_of
 from companion.commissioning.arm.zero import ZeroGuide, ZeroResult
 from companion.commissioning.arm.zero_session import hold
@@ -56,7 +56,7 @@ def _judge_scan(found: Scan, vehicle: Vehicle) -> Report:
         judged.changes,
         advice=[] if wrong else ["the servos match the vehicle file"],
         ok=wrong <= settled,
-        brief={f"arm.scan.joint{n}": f"joint {n}: settings" for n in range(1, len(vehicle.arm.joints) + 1)},
+        brief={f"arm.scan.joint{n}": f"joint {n}: settings" for n in range(1, len(with_clamp(vehicle).joints) + 1)},
     )
 
 

@@ -97,6 +97,7 @@ class HealthEvaluator:
             Lamp.GUARDIAN: _guardian(snapshot),
             Lamp.BATTERY: _battery(snapshot),
             Lamp.TETHER: self._tether_health(snapshot),
+            Lamp.PARTNER: self._partner(snapshot),
         }
         gravest: dict[Lamp, ActiveRule] = {}
         for rule in snapshot.outputs.active or ():
@@ -168,6 +169,15 @@ class HealthEvaluator:
             return HealthLevel.OFF, "not measured"
         near = _flies(snapshot.outputs) and state.stop_slack_m < tether.margin_m
         return HealthLevel.WARN if near else HealthLevel.OK, f"{state.slack_m:.2f} m left"
+
+    def _partner(self, snapshot: Snapshot) -> tuple[HealthLevel, str]:
+        partner = snapshot.inputs.partner
+        if snapshot.outputs.team is None:
+            return HealthLevel.OFF, "this vehicle flies alone"
+        if partner is None:
+            return HealthLevel.WARN, "nothing received yet"
+        age_s = snapshot.inputs.t_s - partner.stamp_s
+        return _level_by_age(age_s, self._s.partner_timeout_s), _age_text(age_s)
 
 
 def _flies(outputs: Outputs) -> bool:

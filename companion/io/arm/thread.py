@@ -19,6 +19,7 @@ from companion.io.device_thread import DeviceThread, resolve
 from companion.io.protocols import DeviceError
 from companion.model.observations import ArmStatement, ServoReport
 from companion.model.servos import WATCHDOG_ERROR
+from companion.model.team import ClampCommand, ClampState
 from companion.model.types import ArmState, Joints
 from companion.runtime.clock import Clock
 from companion.runtime.event_loop import time_stands
@@ -114,6 +115,13 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
     def statement(self) -> ArmStatement | None:
         """Return what a plug-in states about its arm; None for servos, which are read instead."""
         return None
+
+    def clamp(self) -> ClampState | None:
+        """Return the newest state of the clamp; None without one."""
+        return None
+
+    def command_clamp(self, command: ClampCommand | None) -> None:
+        """Command the clamp, which keeps the last command; without one nothing happens. Never waits."""
 
     @property
     def problem(self) -> str:

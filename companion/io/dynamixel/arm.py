@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from companion.config.arm import Arm
+from companion.config.arm import Arm, Jaws
 from companion.config.devices import ArmDevice, DynamixelOptions
 from companion.io.arm.thread import OPEN_TIMEOUT_S, ThreadedArm
 from companion.io.dynamixel.bus import ArmBus, Counts
 from companion.io.dynamixel.registers import WATCHDOG_TRIPPED, Block
 from companion.io.dynamixel.scale import JointScale
 from companion.model.servos import WATCHDOG_ERROR
+from companion.model.team import ClampCommand, ClampState
 from companion.model.types import ArmState, Joints
 from companion.runtime.clock import Clock
 
@@ -23,22 +24,44 @@ class DynamixelArm(ThreadedArm[tuple[Block, ...], Counts]):
         device: port, baud rate, watchdog.
         arm: joints and torque constants.
         clock: the flight clock, source of all stamps.
+        jaws: the clamp's servo; None without a clamp.
     """
 
     options = DynamixelOptions
     writes_at_once = True
 
-    def __init__(self, device: ArmDevice, arm: Arm, clock: Clock) -> None:
+    def __init__(self, device: ArmDevice, arm: Arm, clock: Clock, jaws: Jaws | None = None) -> None:
         super().__init__(f"arm bus {device.port}", device.watchdog_ms, (0,) * len(arm.joints), clock)
-        self._bus = ArmBus(device, arm, self._thread.stopping.is_set)
+        self._bus = ArmBus(device, arm, self._thread.stopping.is_set, jaws)
+        self._clamp: ClampState | None = None
         self._scales: tuple[JointScale, ...] | None = None
+
+    def clamp(self) -> ClampState | None:
+        """Return the newest state of the clamp; None without one."""
+        return self._clamp
+
+    def command_clamp(self, command: ClampCommand | None) -> None:
+        """Command the clamp: at once, or after the thread's next read if it is using the bus; never waits."""
+        jaws = self._bus.jaws
+        if jaws is None or command is None or command is jaws.command:
+            return
+        if self._bus_in_use.acquire(blocking=False):
+            try:
+                self._try(lambda: self._bus.command_jaws(command))
+            finally:
+                self._bus_in_use.release()
+        else:
+            jaws.command = command
 
     def _open_bus(self) -> None:
         self._scales = self._bus.open(OPEN_TIMEOUT_S)
         self._servos = self._bus.reports
 
     def _read_bus(self) -> tuple[Block, ...] | None:
-        return self._bus.read()
+        answer = self._bus.read()
+        if answer is not None and self._bus.jaws is not None and (angle_rad := self._bus.jaws.angle_rad) is not None:
+            self._clamp = ClampState(self._clock(), angle_rad)
+        return answer
 
     def _to_state(self, answer: tuple[Block, ...], asked_s: float) -> ArmState:
         assert self._scales is not None

@@ -13,22 +13,25 @@ from collections.abc import Callable
 import serial
 from dynamixel_sdk import COMM_SUCCESS
 
-from companion.config.arm import Arm, Joint
+from companion.config.arm import Arm, Jaws, Joint
 from companion.config.devices import ArmDevice
 from companion.io.dynamixel import packets
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.access import ATTEMPTS, ERROR_NUMBER, ServoAccess
-from companion.io.dynamixel.registers import Block, Register
+from companion.io.dynamixel.jaws import JawsServo
+from companion.io.dynamixel.registers import Block, JawsBlock, Register
 from companion.io.dynamixel.scale import RAD_PER_COUNT, JointScale
 from companion.io.protocols import DeviceError
 from companion.io.reopening import Reopening
 from companion.model.observations import ServoReport
-from companion.model.servos import COUNTS_PER_TURN, hardware_error_text, model_text
+from companion.model.servos import COUNTS_PER_TURN, ServoKind, hardware_error_text, model_text
+from companion.model.team import ClampCommand
 from companion.runtime.clock import monotonic
 
 _FLIGHT_REPLY_TIMEOUT_MS = 8.0
 """Reply timeout in flight, the longest delay caused by an absent servo."""
 _USB_LATENCY_MAX_MS = 4
+_LOOKS_FOR_JAWS = 2
 _ANSWER_BYTES = packets.STATUS_BYTES + dxl.BLOCK_SIZE
 
 Counts = tuple[int, ...]
@@ -42,9 +45,12 @@ class ArmBus:
         device: port, baud rate, watchdog.
         arm: joints and torque constants.
         aborted: called between the steps of `open`; True aborts it.
+        jaws: the clamp's servo on the same bus; None without a clamp.
     """
 
-    def __init__(self, device: ArmDevice, arm: Arm, aborted: Callable[[], bool] = lambda: False) -> None:
+    def __init__(
+        self, device: ArmDevice, arm: Arm, aborted: Callable[[], bool] = lambda: False, jaws: Jaws | None = None
+    ) -> None:
         self._device = device
         self._joints = arm.joints
         self._torque_constants_nm_a = arm.torque_constants_nm_a
@@ -53,8 +59,13 @@ class ArmBus:
         self._ids = [joint.servo_id for joint in arm.joints]
         self._port = dxl.servo_port(device.port)
         names = {joint.servo_id: f"servo {joint.servo_id} (joint {n})" for n, joint in enumerate(arm.joints, 1)}
+        if jaws is not None:
+            names[jaws.servo_id] = f"servo {jaws.servo_id} (clamp)"
         self._servos = ServoAccess(self._port, f"arm bus {device.port}", names, self._check_time)
-        self._request = packets.sync_read(dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, self._ids)
+        self.jaws = None if jaws is None else JawsServo(jaws, self._servos)
+        """The clamp's servo; None without a clamp."""
+        self._read_ids = self._ids if jaws is None else [*self._ids, jaws.servo_id]
+        self._request = packets.sync_read(dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, self._read_ids)
         self._deadline_s = 0.0
         self._watchdog = device.watchdog_ms // dxl.WATCHDOG_UNIT_MS
         self._reopening: Reopening[serial.Serial] | None = None
@@ -72,15 +83,21 @@ class ArmBus:
         self._deadline_s = monotonic() + timeout_s
         self._open_port()
         for joint in self._joints:
-            self._check_identity(joint)
+            self._check_identity(joint.servo_id, joint.kind)
+        jaws = self.jaws
+        if jaws is not None:
+            self._check_identity(jaws.servo_id, jaws.kind)
+            jaws.set_up()
         self._touched = True
         scales = tuple(
             self._set_up(joint, nm_a) for joint, nm_a in zip(self._joints, self._torque_constants_nm_a, strict=True)
         )
-        blocks = next((found for found in (self.read() for _ in range(ATTEMPTS)) if found is not None), None)
+        answers = (self.read() for _ in range(ATTEMPTS))
+        whole = (found for found in answers if found is not None and (jaws is None or jaws.block is not None))
+        blocks = next(whole, None)
         if blocks is None:
             raise self._error(
-                f"servos {' and '.join(map(str, self._ids))}",
+                f"servos {' and '.join(map(str, self._read_ids))}",
                 "answered individually but not to a sync read; check for a loose cable",
             )
         scales = tuple(
@@ -108,7 +125,10 @@ class ArmBus:
         if not self._is_open():
             return None
         try:
-            return self._read_all()
+            blocks = self._read_all()
+            if self.jaws is not None and self.jaws.pending:
+                self.jaws.send()
+            return blocks
         except BlockingIOError:  # it is there, but sends nothing
             raise
         except (OSError, termios.error):
@@ -152,7 +172,27 @@ class ArmBus:
                     None  # restarted by itself (a loose supply): its indirect addresses are lost, the block is invalid
                 )
             blocks.append(block)
+        if self.jaws is not None:
+            self._read_jaws(self.jaws)
         return tuple(blocks)
+
+    def _read_jaws(self, jaws: JawsServo) -> None:
+        """Take the answer of the clamp's servo, which follows those of the joints at once; do not wait for a servo that is silent."""
+        answer = None
+        for _ in range(_LOOKS_FOR_JAWS):
+            answer = answer or packets.status_data(self._port.peek(_ANSWER_BYTES), jaws.servo_id, dxl.BLOCK_SIZE)
+        jaws.block = None if answer is None else JawsBlock.from_bytes(answer[0])
+
+    def command_jaws(self, command: ClampCommand) -> None:
+        """Command the clamp; never waits.
+
+        Raises:
+            OSError: the port is gone.
+        """
+        if self.jaws is not None:
+            self.jaws.command = command
+            if self._reopening is None:
+                self.jaws.send()
 
     def write_currents(self, counts: Counts) -> None:
         """Perform one sync write of the goal currents, which has no reply; do nothing while the port is being opened again.
@@ -207,43 +247,43 @@ class ArmBus:
                 f"/sys/bus/usb-serial/devices/{self._device.servo_port.rsplit('/', 1)[-1]}/latency_timer (a udev rule keeps it)",
             )
 
-    def _check_identity(self, joint: Joint) -> None:
-        model = self._servos.ping(joint.servo_id)
+    def _check_identity(self, servo_id: int, kind: ServoKind) -> None:
+        model = self._servos.ping(servo_id)
         if model is None:
             answered = self._servos.ping_all()
             others = (
                 f"ids that answer: {', '.join(map(str, sorted(answered)))}" if answered else "no servo answers at all"
             )
             raise self._servos.error(
-                joint.servo_id,
+                servo_id,
                 f"does not answer at {self._device.baud} baud; {others}; check its power, cable, id and baud rate",
             )
-        if model != joint.kind.number:
-            raise self._servos.error(joint.servo_id, f"is {model_text(model)}; the vehicle file says {joint.servo}")
+        if model != kind.number:
+            raise self._servos.error(servo_id, f"is {model_text(model)}; the vehicle file says {kind.name}")
         # A servo set to answer pings only would look dead; the answer to this write does not matter.
-        self._servos.try_write(joint.servo_id, dxl.STATUS_RETURN_LEVEL, 2)
-        firmware = self._servos.read(joint.servo_id, dxl.FIRMWARE)
-        if firmware < joint.kind.firmware_min:
+        self._servos.try_write(servo_id, dxl.STATUS_RETURN_LEVEL, 2)
+        firmware = self._servos.read(servo_id, dxl.FIRMWARE)
+        if firmware < kind.firmware_min:
             raise self._servos.error(
-                joint.servo_id,
-                f"has firmware {firmware}; the {joint.servo} needs {joint.kind.firmware_min} or newer; update it with DYNAMIXEL "
+                servo_id,
+                f"has firmware {firmware}; the {kind.name} needs {kind.firmware_min} or newer; update it with DYNAMIXEL "
                 "Wizard",
             )
-        errors = self._servos.read(joint.servo_id, dxl.HARDWARE_ERROR)
+        errors = self._servos.read(servo_id, dxl.HARDWARE_ERROR)
         if errors:
             raise self._servos.error(
-                joint.servo_id,
+                servo_id,
                 f"reports a hardware error: {hardware_error_text(errors)} ({dxl.HARDWARE_ERROR} = {errors}); "
                 "remove the cause, then run companion arm reboot",
             )
         for register, wanted, why in dxl.REQUIRED:
-            found = self._servos.read(joint.servo_id, register)
+            found = self._servos.read(servo_id, register)
             more = (
                 register == dxl.SHUTDOWN and found & wanted == wanted
             )  # the 330 models leave the factory with one more
             if found != wanted and not more:
                 text = f"{register} is {found}, expected {wanted}, because {why}; run companion arm setup"
-                raise self._servos.error(joint.servo_id, text)
+                raise self._servos.error(servo_id, text)
 
     def _set_up(self, joint: Joint, torque_per_amp_nm_a: float) -> JointScale:
         self._servos.write(joint.servo_id, dxl.TORQUE_ENABLE, 0)
@@ -255,7 +295,7 @@ class ArmBus:
             scale = dxl.joint_scale(joint, torque_per_amp_nm_a, self._servos.read(joint.servo_id, dxl.CURRENT_LIMIT))
         except ValueError as error:
             raise self._servos.error(joint.servo_id, str(error)) from error
-        pointers = b"".join(address.to_bytes(2, "little") for address in dxl.BLOCK_ADDRESSES)
+        pointers = dxl.pointers(dxl.BLOCK)
         indirect = Register(dxl.INDIRECT_ADDRESS_1, len(pointers), "indirect addresses")
         self._servos.write_bytes(joint.servo_id, indirect, pointers)
         self._servos.write(joint.servo_id, dxl.GOAL_CURRENT, 0)

@@ -13,6 +13,7 @@ import os
 import select
 import struct
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -29,6 +30,7 @@ from companion.runtime import simulated_time
 from companion.runtime.simulated_time import SimulatedTime
 
 MODE_CURRENT: Final = 0
+MODE_CURRENT_POSITION: Final = 5
 WATCHDOG_UNIT_MS = 20
 RETURN_DELAY_UNIT_US = 2
 VOLTAGE_UNIT_V = 0.1
@@ -64,6 +66,7 @@ STATUS_RETURN_LEVEL = Register(68, 1, "status return level")
 HARDWARE_ERROR = Register(70, 1, "hardware error status")
 BUS_WATCHDOG = Register(98, 1, "bus watchdog")
 GOAL_CURRENT = Register(102, 2, "goal current", signed=True)
+GOAL_POSITION = Register(116, 4, "goal position", signed=True)
 PRESENT_CURRENT = Register(126, 2, "present current", signed=True)
 PRESENT_VELOCITY = Register(128, 4, "present velocity", signed=True)
 PRESENT_POSITION = Register(132, 4, "present position", signed=True)
@@ -85,8 +88,16 @@ is read or commanded."""
 # answer: once it has removed a stuffed byte, dynamixel-sdk 4.1.0 also removes one from a later FF FD FD, which is data.
 BLOCK = (PRESENT_POSITION, HARDWARE_ERROR, PRESENT_VELOCITY, PRESENT_TEMPERATURE, PRESENT_CURRENT, BUS_WATCHDOG)
 BLOCK_SIZE = sum(register.size for register in BLOCK)
-BLOCK_ADDRESSES = tuple(register.address + i for register in BLOCK for i in range(register.size))
+JAWS_BLOCK = (PRESENT_POSITION, TORQUE_ENABLE, GOAL_POSITION, PRESENT_TEMPERATURE, GOAL_CURRENT, HARDWARE_ERROR)
+"""The block of the clamp's servo, in the same format: whether it has taken its last command shows in the next read."""
 _BLOCK: Final = struct.Struct("<iBiBhB")
+
+
+def pointers(block: Sequence[Register]) -> bytes:
+    """Return the indirect addresses of a block."""
+    return b"".join((one.address + i).to_bytes(2, "little") for one in block for i in range(one.size))
+
+
 _INSTRUCTION_BYTES, _STATUS_BYTES, _GOAL_BYTES = 14, 11, 3
 """Bytes of a sync read or sync write without its servos, of a status packet without its data, and per servo in the sync write."""
 
@@ -125,6 +136,26 @@ class Block:
     def from_bytes(data: bytes) -> Block:
         """Decode `BLOCK_SIZE` bytes of indirect data."""
         return Block(*_BLOCK.unpack(data))
+
+
+@dataclass(frozen=True, slots=True)
+class JawsBlock:
+    """The data of the clamp's servo in the read of a cycle, in register units."""
+
+    position_count: int
+    torque_on: int
+    goal_count: int
+    temperature_c: int
+    goal_current: int
+    hardware_error: int
+
+    @staticmethod
+    def from_bytes(data: bytes) -> JawsBlock | None:
+        """Decode `BLOCK_SIZE` bytes of indirect data; None if they are those of a servo that has restarted (a loose supply): its
+        indirect addresses are lost, and all bytes are zero.
+        """
+        block = JawsBlock(*_BLOCK.unpack(data))
+        return block if block.temperature_c else None
 
 
 def joint_scale(joint: Joint, torque_per_amp_nm_a: float, current_limit_counts: int) -> JointScale:

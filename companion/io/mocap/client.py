@@ -16,6 +16,7 @@ from companion.io.mocap.markers import marker_frame
 from companion.io.mocap.natnet import OLDEST_VERSION, Malformed, Message, ServerInfo, Version
 from companion.io.mocap.server_clock import ServerClock
 from companion.model.markers import MarkerFrame
+from companion.model.team import BarPose
 from companion.model.types import IDENTITY_QUAT, MocapPose, Vec3
 from companion.safety.stream_watch import StreamWatch
 
@@ -178,6 +179,26 @@ class NatNetClient:
             positions = tuple([natnet.z_up_from_y_up(position, IDENTITY_QUAT)[0] for position in positions])
         near_m = self._tracked_m if self._up_axis == "z" else natnet.z_up_from_y_up(self._tracked_m, IDENTITY_QUAT)[0]
         return marker_frame(stamp_s, frame.age_s, frame.number, positions, near_m)
+
+    def bar(self, frame: Frame, datagram: bytes, bar_id: int, stamp_s: float) -> BarPose | None:
+        """Return the bar's rigid body in the world frame, or None if the frame does not contain it.
+
+        Args:
+            frame: as returned by `receive`.
+            datagram: the datagram from which the frame was read.
+            bar_id: streaming id of the bar's rigid body.
+            stamp_s: arrival of the datagram on the flight clock, s.
+        """
+        body = self.other_body(datagram, bar_id) if bar_id in frame.body_ids else None
+        pose = None if body is None else self.pose(frame._replace(body=body), stamp_s)
+        if pose is None:
+            return None
+        return BarPose(
+            stamp_s=stamp_s,
+            position_world_m=pose.position_world_m,
+            attitude_wxyz=pose.attitude_wxyz,
+            tracking_valid=pose.tracking_valid,
+        )
 
     def _receive_info(self, datagram: bytes, arrived_s: float) -> None:
         info = natnet.parse_server_info(datagram)

@@ -9,6 +9,7 @@ from typing import Final, TypeVar
 
 from companion.io.mocap.system import ExtendedClient, MocapSettings, PoseClient, markers_problem, valid_poses
 from companion.model.markers import MarkerFrame
+from companion.model.team import BarPose
 from companion.model.types import MocapPose
 from companion.plugins import one_line
 from companion.runtime.clock import Clock
@@ -65,6 +66,10 @@ class ContainedClient:
     def markers(self) -> MarkerFrame | None:
         """Return the valid single markers of the newest frame, or None; call it after `poses`."""
         return self._call("markers()", self._valid_markers, None)
+
+    def bar(self) -> BarPose | None:
+        """Return the bar's rigid body in the newest frame that had it, or None; call it after `poses`."""
+        return self._call("bar()", lambda _: self.extended.bar(), None)
 
     def _valid_markers(self, now_s: float) -> MarkerFrame | None:
         frame = self.extended.markers()

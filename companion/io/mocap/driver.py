@@ -17,6 +17,7 @@ from companion.io.mocap.system import ExtendedClient, MocapSettings, PoseClient
 from companion.io.protocols import DeviceError
 from companion.model.markers import MarkerFrame
 from companion.model.observations import MocapCounts, MocapServer
+from companion.model.team import BarPose
 from companion.model.types import MocapPose
 from companion.plugins import MOCAP_SYSTEMS, PluginError, one_line
 from companion.runtime.clock import Clock
@@ -84,6 +85,7 @@ class MocapDriver:
         self._answered, self._received = asyncio.Event(), asyncio.Event()
         self._latest: MocapPose | None = None
         self._markers: MarkerFrame | None = None
+        self._bar: BarPose | None = None
         self._frames = self._superseded = 0
         self._logged: str | None = None
         self._callback_error: str | None = None
@@ -95,6 +97,10 @@ class MocapDriver:
     def markers(self) -> MarkerFrame | None:
         """Return the single markers of the newest frame, or None without `devices.mocap.ball`; never blocks."""
         return self._markers
+
+    def bar(self) -> BarPose | None:
+        """Return the bar's rigid body in the newest frame that had it, or None without `devices.mocap.bar_id`; never blocks."""
+        return self._bar
 
     @property
     def client(self) -> ContainedClient:
@@ -220,6 +226,8 @@ class MocapDriver:
         poses = client.poses()
         if self._device.ball is not None:
             self._markers = client.markers()
+        if self._device.bar_id is not None:
+            self._bar = client.bar()
         if not self._received.is_set():
             self._note_opening(client, poses)
         if not poses:

@@ -17,6 +17,7 @@ from companion.io.mocap.natnet import Message
 from companion.io.mocap.system import Counts, ExtendedClient, MocapSettings
 from companion.io.protocols import DeviceError
 from companion.model.markers import MarkerFrame
+from companion.model.team import BarPose
 from companion.model.types import MocapPose
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ class OptiTrack(ExtendedClient):
         self.protocol = NatNetClient(settings.rigid_body_id, settings.up_axis, settings.transport, ball=settings.ball)
         """State of the protocol, for tools."""
         self._markers: MarkerFrame | None = None
+        self._bar: BarPose | None = None
         self._foreign = 0
         self._foreign_ip: str | None = None
         self._unsent = ""
@@ -100,6 +102,10 @@ class OptiTrack(ExtendedClient):
         """Return the single markers of the newest frame, or None if the mission follows no ball."""
         return self._markers
 
+    def bar(self) -> BarPose | None:
+        """Return the bar's rigid body in the newest frame that had it; None before the first, and without `bar_id`."""
+        return self._bar
+
     def counts(self) -> Counts:
         """Return the numbers of dropped datagrams."""
         return Counts(self.protocol.out_of_order, self.protocol.malformed, self._foreign)
@@ -135,6 +141,8 @@ class OptiTrack(ExtendedClient):
                 if frame is not None:
                     self.take(frame, data, stamp_s)
                     self._markers = self.protocol.markers(frame, data, stamp_s)
+                    if (bar_id := self._settings.bar_id) is not None:
+                        self._bar = self.protocol.bar(frame, data, bar_id, stamp_s) or self._bar
                     if frame.body is not None and (pose := self.protocol.pose(frame, stamp_s)) is not None:
                         found.append(pose)
         return found

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Final, NamedTuple, Protocol
 import msgspec
 
 from companion.model.markers import MARKERS_MAX, MarkerFrame
+from companion.model.team import BarPose
 from companion.model.types import IDENTITY_QUAT, MocapPose
 from companion.runtime.clock import Clock
 
@@ -42,6 +43,8 @@ class MocapSettings:
     type: str = "natnet"
     ball: Mapping[str, Any] | None = None
     """`kind` and `id` of the ball that the mission follows; None if no marker is read, as in the guardian."""
+    bar_id: int | None = None
+    """Id of the rigid body of the bar that two vehicles carry; None if it is not read, as in the guardian."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """`devices.mocap.options`, already checked by the system's model."""
 
@@ -120,6 +123,12 @@ class ExtendedClient:
     def markers(self) -> MarkerFrame | None:
         """Return the single markers of the newest frame that `poses` has read, in the world frame, as
         `companion.io.mocap.markers.marker_frame` builds them; None before the first frame, and without `MocapSettings.ball`.
+        """
+        return None
+
+    def bar(self) -> BarPose | None:
+        """Return the bar's rigid body in the newest frame that had it, in the world frame; None before the first, and without
+        `MocapSettings.bar_id`.
         """
         return None
 

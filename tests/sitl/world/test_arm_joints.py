@@ -31,9 +31,10 @@ from sitl.fast.bus import FastBus, scales_of
 from sitl.fast.loop import FastFlight
 from sitl.faults.injector import Faults
 from sitl.plant import Plant
-from sitl.server import Ports, Sitl
+from sitl.server import Sitl
 from sitl.servo.drive import ServoDrive
 from sitl.servo.from_config import servos_of
+from sitl.wires import MachineWires, Ports
 from sitl.world.start import Start, start_of
 from tests.machines import ARMS, overrides_with_joints, vehicle_with_joints
 from tests.sitl.plants import FixedRotors, OneMachine
@@ -261,13 +262,15 @@ def test_a_vehicle_with_any_number_of_joints_and_any_axes_flies(joints: int, mis
 
 def test_without_an_arm_the_server_opens_no_servo_bus_and_no_force_sensor() -> None:
     config = WorldConfig(payload_kg=0.0, arm_handling=True, faults=(Fault(kind="gust", t_s=0.0, after="start"),))
-    server = Sitl(vehicle_with_joints(0), config, start_of((0.0, 0.0), 0.0, ()), Ports(), lambda _: None)
+    server = Sitl(
+        [MachineWires(vehicle_with_joints(0), config, start_of((0.0, 0.0), 0.0, ()), Ports(), lambda _: None)]
+    )
 
     async def served() -> set[str]:
-        async with server.wires() as devices:
+        async with server.wires() as (devices,):
             for _ in range(5):
                 server._step()
             return set(devices)
 
     assert asyncio.run(served()) == {"autopilot", "mocap"}
-    assert server.plant.t_s == pytest.approx(0.01)
+    assert server.machines[0].plant.t_s == pytest.approx(0.01)

@@ -1,0 +1,133 @@
+"""How well two vehicles carry a bar: the figures of a team's summary."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Sequence
+from statistics import median
+from typing import Any
+
+from companion.analysis.log import FlightLog
+from companion.model.codec import Record
+from companion.model.frames import quat_rotate
+from companion.model.outputs import Outputs
+from companion.model.team import Grip
+from companion.model.types import Quat, Vec3
+
+_NEAR_S = 0.05
+"""Longest time from a tick to the sample of the bar with which it is compared."""
+
+
+class BarSample(Record, frozen=True):
+    """True state of the bar at a time of the world."""
+
+    t_s: float
+    frame: int
+    """Number of the newest motion-capture frame, which relates the clock of the world to that of a log."""
+    position_world_m: Vec3
+    attitude_wxyz: Quat
+    pulls_world_n: tuple[Vec3, Vec3]
+    """Force of each clamp on its handle, the left one first."""
+    gripped: bool
+    """Whether both clamps hold their handles."""
+
+
+class BarTruth(Record, frozen=True):
+    """True course of the bar in a flight."""
+
+    samples: tuple[BarSample, ...]
+    let_go_m: float | None
+    """Largest height above its stand from which the bar has fallen or was let go; None if it was never let go."""
+
+
+class PairFigures:
+    """Collects the errors of the bar at the times at which both vehicles carry it."""
+
+    def __init__(self) -> None:
+        self._squares = [0.0, 0.0, 0.0]
+        """Sums of squares of the place error, the tilt and the internal force."""
+        self._count = 0
+        self._lifts = [0.0, 0.0]
+        """Sums of what each vehicle lifts."""
+
+    def add(self, at: Vec3, attitude: Quat, pulls_world_n: Sequence[Vec3], planned_m: Vec3) -> None:
+        """Add the state of the bar at one time.
+
+        Args:
+            at: true centre, world frame.
+            attitude: true attitude; x points to the left end.
+            pulls_world_n: force of each clamp on its handle, the left one first.
+            planned_m: planned centre, world frame.
+        """
+        along = quat_rotate(attitude, (1.0, 0.0, 0.0))
+        # The force that stretches the bar: half the difference of what its ends are pulled with, outwards.
+        internal = 0.5 * sum(
+            sign * sum(a * b for a, b in zip(pull, along, strict=True))
+            for sign, pull in zip((1, -1), pulls_world_n, strict=True)
+        )
+        tilt_rad = math.asin(max(-1.0, min(1.0, along[2])))
+        for n, value in enumerate((math.dist(at, planned_m), tilt_rad, internal)):
+            self._squares[n] += value * value
+        for machine, pull in enumerate(pulls_world_n):
+            self._lifts[machine] += pull[2]
+        self._count += 1
+
+    def report(self, let_go_m: float | None) -> dict[str, float | None]:
+        """Return the figures of `summary.json`; None where the bar was never carried."""
+        place = tilt = internal = share = None
+        if self._count:
+            place, tilt, internal = (math.sqrt(square / self._count) for square in self._squares)
+            tilt, share = math.degrees(tilt), self._lifts[0] / sum(self._lifts)
+        return {
+            "bar_p_rms_m": place,
+            "bar_tilt_rms_deg": tilt,
+            "internal_force_rms_n": internal,
+            "share": share,
+            "let_go": let_go_m,
+        }
+
+
+def carries(outputs: Outputs) -> bool:
+    """Return whether a vehicle carries its end of the bar in this tick."""
+    return outputs.carry is not None and outputs.team is not None and outputs.team.grip is Grip.CARRYING
+
+
+def figures_of(truth: BarTruth | None, left: FlightLog | None, right: FlightLog | None) -> dict[str, Any]:
+    """Return the figures of a flight over the wires; None where they are not known.
+
+    Args:
+        truth: what the world recorded; None if it recorded nothing.
+        left: log of the vehicle at the left end; None if there is none.
+        right: log of the other vehicle; None if there is none.
+    """
+    figures = PairFigures()
+    if truth is not None and left is not None and right is not None:
+        sides = [_Course(log, truth) for log in (left, right)]
+        for sample in truth.samples:
+            ours, theirs = (side.at(sample.t_s) for side in sides)
+            carry = None if ours is None else ours.carry
+            if sample.gripped and carry and ours and theirs and carries(ours) and carries(theirs):
+                pose = sample.position_world_m, sample.attitude_wxyz
+                figures.add(*pose, sample.pulls_world_n, carry.centre_world_m)
+    return figures.report(None if truth is None else truth.let_go_m)
+
+
+class _Course:
+    """The outputs of a log by the time of the world."""
+
+    def __init__(self, log: FlightLog, truth: BarTruth) -> None:
+        offset_s = 0.0 if log.clock == "simulated" else _offset_s(log, truth)
+        self._outputs = log.outputs
+        self._times_s = [inputs.t_s - offset_s for inputs in log.inputs]
+
+    def at(self, t_s: float) -> Outputs | None:
+        index = bisect.bisect_right(self._times_s, t_s + 1e-6) - 1
+        return None if index < 0 or t_s - self._times_s[index] > _NEAR_S else self._outputs[index]
+
+
+def _offset_s(log: FlightLog, truth: BarTruth) -> float:
+    """Return the flight clock at world time 0, by the motion-capture frames that both have seen."""
+    arrived_s = {inputs.mocap.frame_number: inputs.mocap.stamp_s for inputs in log.inputs if inputs.mocap is not None}
+    offsets_s = [arrived_s[each.frame] - each.t_s for each in truth.samples if each.frame in arrived_s]
+    return median(offsets_s) if offsets_s else 0.0

@@ -1,0 +1,142 @@
+"""`companion team fly|check`: two vehicles that carry a bar between them (docs/team.md)."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from companion.cli.flight import speed_of
+from companion.cli.options import add_law, add_seed, time_stamp
+from companion.config.document import ConfigError
+from companion.config.shipped import names
+from companion.mission.check import check_mission
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.runtime.console import print_error, terminal_console
+from companion.runtime.subprocesses import LaunchError
+from companion.sitl_config.loader import WORLDS
+from companion.sitl_config.team import TEAM_WORLD, TeamConfig, load_team
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command to the sub-parsers of `companion`."""
+    team = commands.add_parser("team", help="two vehicles that carry a bar: fly them in SITL, or check their files")
+    parts = team.add_subparsers(dest="part", required=True, metavar="PART")
+    fly = parts.add_parser(
+        "fly",
+        help="fly both vehicles of a team in the simulated world",
+        description="Fly both vehicles of a team in one simulated world. On hardware, each vehicle flies its own part: "
+        "companion fly FILE --member left|right.",
+    )
+    _add_options(fly)
+    fly.add_argument("--out", metavar="DIR", help="folder for logs and reports (default: flights/TIME-TEAM)")
+    fly.add_argument("--speed", metavar="FACTOR|max", help="as for companion fly")
+    fly.add_argument("--real-time", action="store_true", help="as for companion fly")
+    fly.add_argument("--no-report", action="store_true", help="write only logs and summaries")
+    fly.set_defaults(run=_fly)
+    check = parts.add_parser(
+        "check",
+        help="check the files of a team, and with --sitl the simulated devices of both",
+        description="Check that both vehicles can fly their parts together. With --sitl, also run every check of the preflight.",
+    )
+    _add_options(check)
+    check.set_defaults(run=_check, json=False, hand=False)
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("team", metavar="TEAM", help=f"team: a built-in name ({', '.join(names('teams'))}) or a file")
+    parser.add_argument("--sitl", metavar="stub", help="in the simulated world, with two PX4 stubs")
+    add_law(parser)
+    parser.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="of both members"
+    )
+    parser.add_argument(
+        "--world",
+        default=TEAM_WORLD,
+        metavar=f"{'|'.join(WORLDS)}|FILE",
+        help=f"simulated world: a built-in name or a file (default: {TEAM_WORLD})",
+    )
+    add_seed(parser)
+
+
+def _loaded(arguments: argparse.Namespace) -> TeamConfig:
+    """Return the checked configuration of both members.
+
+    Raises:
+        ConfigError: the files have problems, the members do not go together, or one cannot fly its part.
+    """
+    if arguments.sitl not in (None, "stub"):
+        raise ConfigError(
+            [f"companion team: --sitl={arguments.sitl}: expected --sitl, because a team flies with two PX4 stubs"]
+        )
+    team = load_team(
+        arguments.team,
+        arguments.overrides,
+        controller_law=arguments.controller,
+        preset=arguments.preset,
+        world=arguments.world,
+    )
+    problems = []
+    for end, config in team.members:
+        found = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
+        problems += [f"{end}: {line}" for line in found]
+    if problems:
+        raise ConfigError(problems)
+    return team
+
+
+def _fly(arguments: argparse.Namespace) -> int:
+    from companion.cli.campaign import why_unusable
+    from companion.launcher.team import run_team
+
+    if arguments.sitl is None:
+        print_error(
+            "companion team fly: expected --sitl; on hardware each vehicle flies its part: companion fly FILE --member left"
+        )
+        return EXIT_BAD_INPUT
+    speed = speed_of(arguments)
+    if speed is not None and not speed > 0.0:
+        return EXIT_BAD_INPUT
+    team = _loaded(arguments)
+    out = Path(arguments.out) if arguments.out else Path("flights") / f"{time_stamp()}-{team.name}"
+    problem = why_unusable(out, "summary.json")
+    if problem is not None:
+        print_error(f"companion team fly: --out {out}: {problem}")
+        return EXIT_BAD_INPUT
+    return run_team(team, out, console=terminal_console(), report=not arguments.no_report, speed=speed)
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    team = _loaded(arguments)
+    if arguments.sitl is None:
+        print(f"{team.source}: both members can fly mission {team.left.mission.name!r} together")
+        return EXIT_OK
+    from companion.cli import check
+    from companion.launcher.sitl_process import SitlProcess
+    from companion.launcher.team import linked
+
+    scratch = Path(tempfile.mkdtemp(prefix="companion-check-"))
+    codes = []
+    try:
+        members = linked(team, scratch)
+        for end in members:
+            (scratch / end).mkdir()
+        worlds = SitlProcess.start_all([(config, scratch / end) for end, config in members.items()])
+        try:
+            arguments.plan_only = False
+            for (end, config), world in zip(members.items(), worlds, strict=True):
+                print(f"{end}:", flush=True)
+                codes.append(check.run(arguments, config, world))
+        finally:
+            for world in worlds:
+                world.told.close()
+            for world in worlds:
+                world.stop()
+    except (OSError, LaunchError) as error:
+        print_error(f"companion team check: {error}")
+        codes.append(EXIT_REFUSED)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return max(codes)

@@ -1,0 +1,131 @@
+"""`companion team fly|check`: two flights in one world, from the command to the exit code."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
+from tests.support import PREFLIGHT, ROOT, Sandbox, read_summary, set_options
+
+TEAM = ROOT / "configs/teams/carry.yaml"
+FAST = set_options(**{PREFLIGHT: 1.0, "vehicle.ground.mqtt": None})
+FLY = ("team", "fly", TEAM, "--sitl", "--speed", "max", "--out", "out", *FAST)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            (*FLY, "--set", "vehicle.devices.mocap.rigid_body_id=1"),
+            "both members have devices.mocap.rigid_body_id 1; give each vehicle a rigid body of its own",
+        ),
+        (("team", "fly", TEAM, "--out", "out"), "expected --sitl; on hardware each vehicle flies its part"),
+        (("team", "fly", TEAM, "--sitl", "px4", "--out", "out"), "unknown arguments: px4"),
+        (
+            ("team", "fly", TEAM, "--sitl=px4", "--out", "out"),
+            "expected --sitl, because a team flies with two PX4 stubs",
+        ),
+        (
+            ("team", "fly", "carrry", "--sitl", "--out", "out"),
+            "team carrry: expected carry or a file, found neither (did you mean carry?)",
+        ),
+        (("team", "fly", TEAM, "--sitl", "--speed", "0", "--out", "out"), "--speed 0: expected a number above 0"),
+        (
+            ("fly", "carry", "--sitl", "--out", "out"),
+            "this vehicle flies alone: fly a team file with `companion team fly`",
+        ),
+        (("fly", TEAM, "--member", "left", "--sitl", "--out", "out"), "in the simulated world both fly"),
+    ],
+    ids=["one body", "hardware", "px4 as a word", "px4", "misspelt", "speed", "alone", "member"],
+)
+def test_bad_input_is_one_line_and_nothing_is_started(
+    sandbox: Sandbox, arguments: tuple[object, ...], said: str
+) -> None:
+    ended = sandbox.run(*arguments)
+    assert ended.code == EXIT_BAD_INPUT
+    assert len(ended.err_lines) == 1 and said in ended.err_lines[0], ended.err
+    assert not (sandbox.cwd / "out").exists()
+    sandbox.assert_nobody_left()
+
+
+def test_on_the_vehicle_each_member_flies_its_own_end(sandbox: Sandbox) -> None:
+    """Nothing answers there: the flight is refused, with the member's configuration in its folder."""
+    for end, number in (("left", 1), ("right", 2)):
+        here = {"server": "127.0.0.1", "interface": "127.0.0.1", "transport": "unicast", "command_port": 9}
+        options = set_options(**{f"vehicle.devices.mocap.{key}": value for key, value in here.items()})
+        ended = sandbox.run("fly", TEAM, "--member", end, "--out", end, *options)
+        assert ended.code != EXIT_BAD_INPUT, ended
+        config = json.loads((sandbox.cwd / end / "config.json").read_text(encoding="utf-8"))
+        assert config["vehicle"]["devices"]["mocap"]["rigid_body_id"] == number
+        assert [phase["end"] for phase in config["mission"]["phases"] if phase["type"] == "grip"] == [end]
+
+
+def test_a_check_of_the_files_starts_nothing(sandbox: Sandbox) -> None:
+    ended = sandbox.run("team", "check", TEAM)
+    assert (ended.code, ended.err) == (EXIT_OK, "")
+    assert "both members can fly mission 'carry' together" in ended.out
+
+
+def test_a_team_carries_its_bar_over_wires(sandbox: Sandbox) -> None:
+    ended = sandbox.run(*FLY, "--no-report", "--seed", "1")
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_OK, ended
+    summary = summary_in(sandbox.cwd / "out")
+    assert summary["outcome"] == "completed"
+    assert {end: member["outcome"] for end, member in summary["members"].items()} == {
+        "left": "completed",
+        "right": "completed",
+    }
+    team = summary["team"]
+    assert 0.0 < team["bar_p_rms_m"] < 0.1
+    assert 0.0 < team["bar_tilt_rms_deg"] < 5.0
+    assert 0.0 < team["internal_force_rms_n"] < 10.0
+    assert 0.3 < team["share"] < 0.7
+    assert team["let_go"] < 0.1
+    for end in ("left", "right"):
+        for name in ("flight.mcap", "summary.json", "flight.log", "guardian.log"):
+            assert (sandbox.cwd / "out" / end / name).exists()
+    assert (sandbox.cwd / "out/team.key").stat().st_mode & 0o077 == 0
+
+
+def summary_in(out: Path) -> dict[str, Any]:
+    """The summary of both, and of each in it as it stands in the member's folder."""
+    summary: dict[str, Any] = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert summary["members"] == {end: read_summary(out / end) for end in ("left", "right")}
+    return summary
+
+
+def flight_of(out: Path, end: str) -> int:
+    return int((out / end / "flight.pid").read_text())
+
+
+def test_a_killed_flight_process_lands_both(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY, "--no-report") as running:
+        running.wait_for("carry the bar\n")
+        os.kill(flight_of(sandbox.cwd / "out", "right"), signal.SIGKILL)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    summary = summary_in(sandbox.cwd / "out")
+    assert {end: member["outcome"] for end, member in summary["members"].items()} == {
+        "left": "aborted",
+        "right": "aborted",
+    }
+    assert ended.code == EXIT_ABORTED
+    assert "right: flight: the flight process was ended by SIGKILL; the guardian landed the vehicle" in ended.err
+
+
+def test_ctrl_c_lands_both(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY, "--no-report") as running:
+        running.wait_for("left    t   3.0")
+        running.signal(signal.SIGINT)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_ABORTED
+    summary = summary_in(sandbox.cwd / "out")
+    assert {member["outcome"] for member in summary["members"].values()} == {"aborted"}
