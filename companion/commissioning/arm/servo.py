@@ -43,7 +43,7 @@ def with_clamp(vehicle: Vehicle) -> Arm:
         servo_id=jaws.servo_id,
         sign=1,
         zero_count=0,
-        angle_deg=(min(jaws.open_deg, jaws.closed_deg), max(jaws.open_deg, jaws.closed_deg)),
+        angle_deg=(min(jaws.open_deg, jaws.empty_deg), max(jaws.open_deg, jaws.empty_deg)),
         torque_max_nm=min(jaws.current_a, kind.stall_current_a) * kind.torque_per_amp_nm_a,
         torque_per_amp_nm_a=kind.torque_per_amp_nm_a,
     )
