@@ -43,6 +43,19 @@ def test_a_tool_has_the_keys_of_its_kind(tool: str, line: str) -> None:
     assert [text.split(": tool.")[1] for text in refused.value.lines] == [line]
 
 
+@pytest.mark.parametrize(
+    ("override", "line"),
+    [
+        ("vehicle.tool.jaws.servo_id=2", "joint 2 has the servo id 2 too; give each servo its own id"),
+        ("vehicle.devices.arm.type=steady", "tool.jaws: a clamp needs devices.arm.type dynamixel, got steady"),
+    ],
+)
+def test_a_clamp_has_a_servo_of_its_own_on_a_bus_of_dynamixel_servos(override: str, line: str) -> None:
+    with pytest.raises(ConfigError) as refused:
+        load_flight("configs/missions/hover.yaml", "configs/vehicles/tarot650_2r_clamp.yaml", overrides=[override])
+    assert [text for text in refused.value.lines if text.endswith(line)]
+
+
 def test_the_rod_reaches_beyond_the_rotors_and_below_them() -> None:
     x_m, y_m, z_m = manipulator_of(ROD).net_body_m(PRESS)
     assert x_m >= ROD.airframe.radius_m + 0.25

@@ -10,6 +10,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+import pytest
+
 from companion.config.loader import FlightConfig, load_flight
 from companion.flight.command_queue import Operator
 from companion.flight.control_loop import Flight
@@ -21,12 +23,13 @@ from companion.model.markers import MarkerFrame
 from companion.model.observations import (
     ArmStatement,
     ForceCounts,
+    LinkCounts,
     MocapCounts,
     MocapServer,
     ServoReport,
     StateCounts,
 )
-from companion.model.team import BarPose, ClampCommand, ClampState
+from companion.model.team import BarPose, ClampCommand, ClampState, Grip, PartnerState, TeamState
 from companion.model.types import (
     IDENTITY_QUAT,
     ArmState,
@@ -46,7 +49,7 @@ from companion.model.types import (
 from companion.recorder.client import RecorderProcess
 from companion.runtime import ipc
 from companion.runtime.clock import Clock, flight_clock
-from tests.support import DEADLINE_S, HOVER
+from tests.support import DEADLINE_S, HOVER, ROOT
 
 ZERO = (0.0, 0.0, 0.0)
 RECORDED = MocapCounts(
@@ -179,11 +182,13 @@ class OtherArm(Standing):
     statement: ArmStatement | None = None
     read_takes_s = 0.001
 
+    commanded = 0
+
     def clamp(self) -> ClampState | None:
-        return None
+        return ClampState(self.clock(), math.radians(90.0))
 
     def command_clamp(self, command: ClampCommand | None) -> None:
-        pass
+        self.commanded += 1
 
     def latest(self) -> ArmState | None:
         return ArmState(
@@ -225,11 +230,31 @@ class OtherForceTorque(Standing):
         )
 
 
-def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path) -> None:
-    config, clock = unflown(load_flight(HOVER)), flight_clock()
+class OtherTeam(Standing):
+    def __init__(self, config: FlightConfig, clock: Clock) -> None:
+        super().__init__(config, clock)
+        self.announced: list[TeamState] = []
+
+    def announce(self, said: TeamState) -> None:
+        self.announced.append(said)
+
+    def newest(self) -> PartnerState | None:
+        said = TeamState(grip=Grip.FREE, holds=False, lands=False, px4_lands=False, position_world_m=(9.0, 0.0, 1.0))
+        return PartnerState(stamp_s=self.clock(), said=said)
+
+    def counts(self) -> LinkCounts:
+        return LinkCounts()
+
+
+@pytest.mark.parametrize("in_a_team", [False, True])
+def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path, in_a_team: bool) -> None:
+    clamp = ROOT / "configs/vehicles/tarot650_2r_clamp.yaml" if in_a_team else None
+    overrides = ["vehicle.devices.team={}", "vehicle.tether=null"] if in_a_team else []
+    config, clock = unflown(load_flight(HOVER, clamp, overrides=overrides)), flight_clock()
     launcher, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     channel.setblocking(False)
     autopilot, arm = ObedientAutopilot(config, clock), OtherArm(config, clock)
+    team = OtherTeam(config, clock) if in_a_team else None
     autopilot.on_armed = lambda: ipc.send(launcher, Land())
     devices = Devices(
         forwarder=PoseForwarder(),
@@ -237,6 +262,7 @@ def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path) ->
         mocap=OtherMocap(config, clock),
         arm=arm,
         force=OtherForceTorque(config, clock),
+        team=team,
     )
 
     async def flown() -> Outcome:
@@ -252,3 +278,5 @@ def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path) ->
         finally:
             recorder.finish()
     assert autopilot.mode is FlightMode.OFFBOARD and autopilot.setpoints > 0 and not autopilot.armed
+    assert arm.commanded > 0
+    assert team is None or team.announced[-1].position_world_m == autopilot.position_m
