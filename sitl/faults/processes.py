@@ -55,7 +55,8 @@ def inject_process_fault(kind: FaultKind, flight_pid: int) -> bool:
     """
     module = "companion.guardian" if kind == "kill_guardian" else "companion.recorder.main"
     parent = os.getppid() if kind == "kill_guardian" else flight_pid
-    pid = next((pid for pid in _children(parent) if module in _command(pid)), None)
+    found = (pid for pid in _children(parent) if module in _command(pid))
+    pid = next((pid for pid in found if parent == flight_pid or _config(pid) == _config(flight_pid)), None)
     if pid is None:
         return False
     with contextlib.suppress(ProcessLookupError):
@@ -80,6 +81,12 @@ def _command(pid: int) -> list[str]:
     with contextlib.suppress(OSError):
         return Path(f"/proc/{pid}/cmdline").read_text().split("\0")
     return []
+
+
+def _config(pid: int) -> str | None:
+    """Return the file of a process's configuration, which those of one vehicle share; None if its command line names none."""
+    words = _command(pid)
+    return words[words.index("--config") + 1] if "--config" in words else None
 
 
 class ProcessFaults:

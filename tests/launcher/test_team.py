@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from tests.support import PREFLIGHT, ROOT, Sandbox, read_summary, set_options
 
 TEAM = ROOT / "configs/teams/carry.yaml"
@@ -129,3 +129,26 @@ def test_ctrl_c_lands_both(sandbox: Sandbox) -> None:
     assert ended.code == EXIT_ABORTED
     summary = summary_in(sandbox.cwd / "out")
     assert {member["outcome"] for member in summary["members"].values()} == {"aborted"}
+
+
+def test_a_member_that_is_refused_keeps_the_other_on_the_ground(sandbox: Sandbox) -> None:
+    text = TEAM.read_text(encoding="utf-8").replace("../missions", str(ROOT / "configs/missions"))
+    (sandbox.cwd / "flat.yaml").write_text(f"{text}      world.battery_start: 0.05\n", encoding="utf-8")
+    ended = sandbox.run("team", "fly", "flat.yaml", *FLY[3:], "--no-report")
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_REFUSED
+    assert "right: battery: 5%" in ended.err
+    members = summary_in(sandbox.cwd / "out")["members"]
+    assert (members["left"]["outcome"], members["right"]["outcome"]) == ("aborted", "refused")
+    assert not {"armed", "takeoff"} & {event["id"] for event in members["left"]["events"]}
+
+
+def test_without_its_world_a_team_is_lost_and_nothing_is_left(sandbox: Sandbox) -> None:
+    with sandbox.start(*FLY, "--no-report") as running:
+        running.wait_for("take-off\n")
+        os.kill(sandbox.pid_of("sitl"), signal.SIGKILL)
+        ended = running.end()
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_LOST
+    for end in ("left", "right"):
+        assert f"{end}: sitl: the simulated world was ended by SIGKILL" in ended.err

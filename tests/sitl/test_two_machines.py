@@ -7,6 +7,8 @@ import contextlib
 import math
 import os
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -16,12 +18,14 @@ from companion.model.types import Vec3
 from companion.runtime.simulated_time import Descriptors, Page, SimulatedTime
 from companion.sitl_config.faults import Fault
 from companion.sitl_config.team import load_team
+from sitl.faults.processes import inject_process_fault
 from sitl.lockstep import MachineTime, TimeKeeper
 from sitl.natnet import BodyPose
 from sitl.server import Sitl
 from sitl.wires import MachineWires, Ports
 from sitl.world.pair import pair_scene
 from sitl.world.start import start_of
+from tests.support import DEADLINE_S, wait_until
 
 
 def server_of(*overrides: str) -> Sitl:
@@ -147,3 +151,18 @@ def test_figures_of_a_bar_that_is_stretched_tilted_and_beside_its_place() -> Non
     assert found["share"] == pytest.approx((3.0 + 2.0 * along[2]) / 4.0)
     assert found["let_go"] == 0.2
     assert PairFigures().report(None) == dict.fromkeys(found)
+
+
+def test_the_guardian_that_is_killed_is_that_of_the_same_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+    def process(*words: str) -> subprocess.Popen[bytes]:
+        return subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)", *words])
+
+    with contextlib.ExitStack() as stack:
+        guardians = [stack.enter_context(process("companion.guardian", "--config", end)) for end in ("left", "right")]
+        flight = stack.enter_context(process("companion.flight.main", "--config", "right"))
+        for each in (*guardians, flight):
+            stack.callback(each.kill)
+        monkeypatch.setattr(os, "getppid", os.getpid)
+        wait_until(lambda: inject_process_fault("kill_guardian", flight.pid), lambda: "no guardian found")
+        assert guardians[1].wait(DEADLINE_S) != 0
+        assert guardians[0].poll() is None
