@@ -139,8 +139,6 @@ class Bar:
         return math.dist(at, vec3_of(self._tips[number])) <= self._true.capture_m
 
     def _take(self, number: int, t_s: float) -> None:
-        if not self.is_near(number):
-            return
         clamp, handle = self._clamps[number], self._handles[number]
         self._model.eq_data[clamp, 0:3] = 0.0
         self._model.eq_data[clamp, 3:6] = handle

@@ -85,7 +85,7 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "missing mission": (("fly", "nofile.yaml", "--sitl"), (r"^nofile\.yaml: no such file$",)),
     "no such built-in mission": (
         ("fly", "cath", "--sitl"),
-        (r"^mission cath: expected catch, circuit, .* or a file, found neither \(did you mean catch\?\)$",),
+        (r"^mission cath: expected carry, catch, circuit, .* or a file, found neither \(did you mean catch\?\)$",),
     ),
     "no such built-in vehicle": (
         (*FLY, "--vehicle", "tarot"),
