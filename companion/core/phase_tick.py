@@ -136,9 +136,10 @@ class _PhaseTick(Air):
 
     def __init__(self, t: Transition, segment: Segment, engaged: Segment) -> None:
         p = t.parameters
-        nominal = t.state.supervisor.action is SafetyAction.NOMINAL
+        action = t.state.supervisor.action
+        nominal, holds = action is SafetyAction.NOMINAL, action.rank >= SafetyAction.HOLD.rank
         limits = p.config.mission.limits
-        super().__init__(t.o, p.vehicle, p.manipulator, p.phases, segment, engaged, limits, p.safe, nominal)
+        super().__init__(t.o, p.vehicle, p.manipulator, p.phases, segment, engaged, limits, p.safe, nominal, holds)
         self._t = t
 
     @property

@@ -114,6 +114,7 @@ class Air:
         limits: limits of the mission.
         safe: the governor's safe set.
         nominal: whether the supervisor has not reacted to anything so far.
+        holds: whether it has reacted by a hold or more; a mere warning stops no plan.
     """
 
     def __init__(
@@ -127,6 +128,7 @@ class Air:
         limits: Limits,
         safe: SafeSet,
         nominal: bool,
+        holds: bool = False,
     ) -> None:
         self.o = o
         self.i = o.inputs
@@ -140,6 +142,7 @@ class Air:
         self.limits = limits
         self.safe = safe
         self.nominal = nominal
+        self.holds = holds
         self.skips_rest = False
         """Whether the phases that follow and need the state of this one are skipped when it ends."""
 

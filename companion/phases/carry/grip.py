@@ -168,7 +168,7 @@ class GripHandle(Phase):
             return s
         if not s.closes:
             s = replace(s, at_handle_s=self._at_handle_since_s(air, s))
-            ready = air.nominal and air.t_s - s.at_handle_s >= SETTLE_S
+            ready = not air.holds and air.t_s - s.at_handle_s >= SETTLE_S
             s = replace(s, closes=ready and self._is_near(air, s) and is_at(air.i, air.vehicle.jaws, ClampCommand.OPEN))
         elif s.closed_s == math.inf and is_empty(air.i, air.vehicle.jaws):
             air.report(GRIPPED_NOTHING, f"the jaws have closed beside the {self.end} handle; trying again beside it")
@@ -183,7 +183,7 @@ class GripHandle(Phase):
             s = replace(s, lift_server_s=lift_s)
             if server_s(air.i) >= lift_s:
                 return None
-        if air.t_s - s.waits_since_s > self.wait_max_s and air.nominal:
+        if air.t_s - s.waits_since_s > self.wait_max_s and not air.holds:
             air.report(NOT_GRIPPED, f"after {self.wait_max_s:g} s {self._missing(s)}; landing")
         return s
 
@@ -261,7 +261,7 @@ class GripHandle(Phase):
         """Return when the bar is lifted, as the left member has set it; None while one of the two is not ready."""
         partner = air.i.partner
         fresh = partner is not None and air.t_s - partner.stamp_s <= PARTNER_FRESH_S
-        if partner is None or not fresh or not air.nominal or s.closed_s == math.inf or partner.said.holds:
+        if partner is None or not fresh or air.holds or s.closed_s == math.inf or partner.said.holds:
             return None
         if self.end == "right":
             if partner.said.grip is Grip.CARRYING and s.lift_server_s is None:
