@@ -86,7 +86,7 @@ class Bar:
     ) -> None:
         model, data = bodies[0].model, bodies[0].data
         self._model, self._data, self._machines, self._events = model, data, machines, events
-        self._true = spec.true
+        self._true, self._strength_n = spec.true, spec.true.strength_n
         body = model.body(BAR).id
         self._at, self._axes, self._quat = data.xpos[body], data.xmat[body], data.xquat[body]
         self._velocity = data.qvel[int(model.jnt_dofadr[model.joint(BAR).id]) :][:3]
@@ -155,7 +155,7 @@ class Bar:
     def _slips(self, number: int) -> bool:
         """Return whether the handle is pulled out of the jaws."""
         force = self.pull_n(number)
-        return force > self._true.strength_n
+        return force > self._strength_n
 
     def pull_n(self, number: int) -> float:
         """Return the size of the force between a clamp and its handle."""

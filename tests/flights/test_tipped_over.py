@@ -28,7 +28,7 @@ class TippedOver(FastFlight):
         low = [f"{key}={value}" for key, value in LOW_HOVER.items()]
         super().__init__(load_sitl(HOVER, overrides=[*low, f"world.faults=[{', '.join(faults)}]"]))
         self.begun_s = self.stopped_s = math.inf
-        scene, machine, step = self.plant.scene, self.plant.machine, self.plant.step
+        scene, machine, act = self.plant.scene, self.plant.machine, self.plant.act
 
         def tipping(armed: bool) -> None:
             if armed and scene.t_s > after_s and machine.q[2] < below_m:
@@ -41,9 +41,9 @@ class TippedOver(FastFlight):
                 machine.hold(Wrench(force_n=(0.0, 0.0, 0.0), torque_nm=(torque_nm, 0.0, 0.0)))
                 if not armed:
                     self.stopped_s = min(self.stopped_s, scene.t_s)
-            step(armed)
+            act(armed)
 
-        self.plant.step = tipping  # type: ignore[method-assign]
+        self.plant.act = tipping  # type: ignore[method-assign]
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,10 @@ import pytest
 from companion.config.base import Model
 from companion.sitl_config.faults import CONTACT_PHASES, KINDS, FaultKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
+from companion.sitl_config.team import load_team
 from companion.sitl_config.world import World
 from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.team import FastTeam
 from tests.support import HOVER, SHORT_CATCH, set_options
 
 Settings = dict[str, Any]
@@ -84,6 +86,7 @@ def test_every_setting_is_read_by_the_simulated_world(monkeypatch: pytest.Monkey
         (load_sitl(HOVER, overrides=handled), 0.6),
         (load_sitl(HOVER, overrides=waiting), 9.5),
     ]
+    pair = load_team("carry", ["world.bar={}"])
     read: set[str] = set()
 
     def reading(model: Model, name: str) -> Any:
@@ -94,6 +97,7 @@ def test_every_setting_is_read_by_the_simulated_world(monkeypatch: pytest.Monkey
     with monkeypatch.context() as patched:
         patched.setattr(Model, "__getattribute__", reading)
         results = [FastFlight(config).run(limit_s) for config, limit_s in flights]
+        FastTeam(pair).run(0.6)
     assert results[0].caught
     parts: list[type[Model]] = [World, *PARTS.values()]
     settings = {f"{part.__name__}.{name}" for part in parts for name in part.model_fields}
