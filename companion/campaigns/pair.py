@@ -58,6 +58,16 @@ class PairRobustness(Campaign):
             }
         }
 
+    def csv_row(self, row: Row) -> dict[str, Any]:
+        """Return the row as columns of the CSV file, each member's events in one of its own."""
+        members = zip(("left", "right"), row["outcomes"], row["events"], strict=True)
+        of_each = {
+            key: value
+            for name, outcome, events in members
+            for key, value in ((f"{name}_outcome", outcome), (f"{name}_events", " ".join(events)))
+        }
+        return {key: value for key, value in row.items() if key not in ("outcomes", "events")} | of_each
+
     def page(self, rows: Sequence[Row], pictures: Sequence[Picture]) -> Page:
         """Return the page."""
         unsafe = sum(row["outcome"] not in SAFE for row in rows)
