@@ -29,6 +29,7 @@ from companion.model.best_pose import pose_used_s
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.flight_stage import Stage
 from companion.model.outputs import ControlLog, Outputs
+from companion.model.team import Grip
 from companion.model.types import (
     Event,
     Inputs,
@@ -47,7 +48,7 @@ from companion.safety.gate import ARM_FRESH_S, Gate, Refusal
 from companion.safety.governor import Governor
 from companion.safety.monitors import Monitors
 from companion.safety.pose_filter import PoseFilter
-from companion.safety.rules import OPERATOR_RESUME
+from companion.safety.rules import OPERATOR_RESUME, PARTNER_HOLDS
 from companion.safety.tether import TetherWatch
 
 _DT_MIN_S: Final = 0.001
@@ -199,12 +200,13 @@ class FlightCore:
         i = self._monitors.trusted
         assert i is not None
         self._watch_tether(i)
-        resume = bool(events) and any(event.id == OPERATOR_RESUME for event in events)
+        carries = self._state.grip is Grip.CARRYING and self._state.supervisor.action is SafetyAction.HOLD
+        resume = carries or (bool(events) and any(event.id == OPERATOR_RESUME for event in events))
         return events, Observation(
             inputs=i,
             airborne=context.airborne,
             armed_by_others=armed_by_others,
-            standing=self._monitors.standing() if resume else None,
+            standing=self._monitors.standing(PARTNER_HOLDS if carries else None) if resume else None,
             reference=self._reference,
             tether=context.tether,
             thrust_share=self._control.thrust_share,

@@ -71,7 +71,7 @@ def team_state_of(state: FlightState, i: Inputs) -> TeamState:
     action, vehicle = state.supervisor.action, i.vehicle
     return TeamState(
         grip=state.grip,
-        lift_server_s=state.expected.lift_server_s,
+        together=state.expected.together,
         holds=action.rank >= SafetyAction.HOLD.rank,
         lands=state.aborting and action.rank >= SafetyAction.LAND.rank,
         px4_lands=state.stage is Stage.AUTOPILOT_LAND,

@@ -12,7 +12,9 @@ from companion.mission.segments import Segment
 from companion.model.codec import R, Record, RecordError, from_packet, to_packet
 from companion.model.types import Outcome, Reference, SafetyAction
 from companion.plugins import one_line
+from companion.safety import rules
 from companion.safety.notices import EventDefinition
+from companion.safety.supervisor import SupervisorState
 
 _BEFORE_END_S = 1e-6
 
@@ -138,8 +140,13 @@ class _PhaseTick(Air):
         p = t.parameters
         action = t.state.supervisor.action
         nominal, holds = action is SafetyAction.NOMINAL, action.rank >= SafetyAction.HOLD.rank
-        limits = p.config.mission.limits
-        super().__init__(t.o, p.vehicle, p.manipulator, p.phases, segment, engaged, limits, p.safe, nominal, holds)
+        limits, waits = (
+            p.config.mission.limits,
+            t.state.supervisor.cause == rules.PARTNER_HOLDS and t.o.standing is None,
+        )
+        super().__init__(
+            t.o, p.vehicle, p.manipulator, p.phases, segment, engaged, limits, p.safe, nominal, holds, waits
+        )
         self._t = t
 
     @property
@@ -147,6 +154,10 @@ class _PhaseTick(Air):
         course = self._t.state.course
         assert course is not None
         return course
+
+    def plan_s(self) -> float:
+        """Return the plan's time since the start of the phase whose state it is."""
+        return self._course.pace(self.t_s)[0] - self.engaged.start_s
 
     def plan_reference(self) -> Reference:
         """Return the plan's reference, without what the phase adds."""
@@ -162,6 +173,14 @@ class _PhaseTick(Air):
         self._t.finish(Outcome.ABORTED)
         self._t.change(course=self._course.hold(self.t_s))
 
+    def resume(self, notice: EventDefinition, text: str) -> None:
+        """End the hold, if the operator has said so to every vehicle that has begun one, and report it."""
+        self._t.report(notice, text)
+        self._t.change(supervisor=SupervisorState(SafetyAction.NOMINAL, notice.id, self.t_s))
+        self._t.change(course=self._course.resume(self.t_s))
+        self._t.resumed = True
+        self.holds = self.waits = False
+
     def stay(self, segment: Segment) -> None:
         """Keep the plan's time before the end of a segment."""
         course, last_s = self._course, segment.end_s - _BEFORE_END_S
@@ -169,5 +188,5 @@ class _PhaseTick(Air):
             self.move_to(last_s)
 
     def move_to(self, plan_s: float) -> None:
-        """Move the plan's time to a start or an end of a segment, where the plan is at rest."""
+        """Move the plan's time to a start or an end of a segment, where the plan is at rest, or to any place of it during a hold."""
         self._t.change(course=self._course.moved_to(plan_s, self.t_s))

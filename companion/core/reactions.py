@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Final
 
 from companion.core.phase_tick import PhaseFailed, leave
@@ -11,10 +12,11 @@ from companion.mission.plan import landing_from
 from companion.mission.retract import inward_only, retract_from
 from companion.model import flight_stage as seq
 from companion.model.flight_stage import ROTORS_MAY_START, Stage
+from companion.model.team import Grip
 from companion.model.types import OperatorCommand, Outcome, PhaseKind, Reference, SafetyAction, Vec3
 from companion.safety import notices
 from companion.safety.notices import EventDefinition
-from companion.safety.rules import OPERATOR_ABORT, OPERATOR_LAND, OPERATOR_RESUME, RULES
+from companion.safety.rules import OPERATOR_ABORT, OPERATOR_LAND, OPERATOR_RESUME, PARTNER_HOLDS, RULES
 from companion.safety.supervisor import update
 
 HOLD_ABOVE_M = 0.3
@@ -44,10 +46,20 @@ def supervise(t: Transition) -> None:
 
 
 def _escalate(t: Transition) -> None:
-    before, standing = t.state.supervisor, None
-    if before.action is _HOLD and any(event.id == OPERATOR_RESUME for event in t.events):
+    before, events, standing = t.state.supervisor, t.events, None
+    if before.cause == PARTNER_HOLDS:
+        own = next((event.id for event in events if event.action is _HOLD and event.id != PARTNER_HOLDS), None)
+        if own is not None:  # now this vehicle, too, is to be resumed by the operator
+            t.change(supervisor=replace(before, cause=own))
+            before = t.state.supervisor
+    if before.action is _HOLD and any(event.id == OPERATOR_RESUME for event in events):
         standing = t.o.standing
-    after = update(before, t.events, t.i.t_s, t.parameters.times, standing)
+        if (
+            standing is None and t.state.grip is Grip.CARRYING
+        ):  # the phase ends the hold, at one instant with the other vehicle
+            t.change(supervisor=replace(before, cause=PARTNER_HOLDS))
+            before, events = t.state.supervisor, [event for event in events if event.id != OPERATOR_RESUME]
+    after = update(before, events, t.i.t_s, t.parameters.times, standing)
     if after is not before:
         t.change(supervisor=after)
     if after.action is before.action:

@@ -26,6 +26,7 @@ _SENTENCES = {
     Answer.ALREADY_HOLDING: "already holding",
     Answer.TOO_LOW_TO_HOLD: "too low to hold: landing",
     Answer.CONTINUING: "continuing",
+    Answer.CONTINUING_TOGETHER: "continuing as soon as the other vehicle may continue, too",
     Answer.LANDING_CONTINUES: "the landing continues",
     Answer.LANDING: "landing",
     Answer.ABORTED: "aborted: landing and folding the arm",
@@ -105,8 +106,10 @@ def _resume(before: FlightState, after: FlightState, kind: PhaseKind, texts: Map
     held = before.supervisor.action is SafetyAction.HOLD
     if not held or after.supervisor.action.rank > SafetyAction.HOLD.rank:
         return Verdict(accepted=False, answer=_instead(after, kind))
-    landing = kind is PhaseKind.LANDING
-    return Verdict(accepted=True, answer=Answer.LANDING_CONTINUES if landing else Answer.CONTINUING)
+    if kind is PhaseKind.LANDING:
+        return Verdict(accepted=True, answer=Answer.LANDING_CONTINUES)
+    waits = after.supervisor.action is SafetyAction.HOLD
+    return Verdict(accepted=True, answer=Answer.CONTINUING_TOGETHER if waits else Answer.CONTINUING)
 
 
 def _start(before: FlightState, after: FlightState, kind: PhaseKind, texts: Mapping[str, str]) -> Verdict:

@@ -80,7 +80,9 @@ class ActiveTrajectory:
         return self._turned_to(1.0, t_s) if self.held else self
 
     def moved_to(self, plan_s: float, t_s: float) -> ActiveTrajectory:
-        """Return the course with another plan time at `t_s`, held if this one is held. The plan must be at rest at both times."""
+        """Return the course with another plan time at `t_s`, held if this one is held. Unless it is held, the plan must be at rest at
+        both times.
+        """
         if not self.held:
             return replace(self, start_s=t_s - plan_s, change=None)
         change = Change(begin_s=t_s, plan_s=plan_s, duration_s=STOP_MIN_S, before=0.0, after=0.0)

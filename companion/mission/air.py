@@ -15,7 +15,7 @@ from companion.model.contact import ContactState
 from companion.model.frames import quat_rotate
 from companion.model.markers import BallState
 from companion.model.outputs import ChaseState, TetherState
-from companion.model.team import CarryState, ClampCommand, Grip
+from companion.model.team import CarryState, ClampCommand, Grip, Together
 from companion.model.types import Inputs, MocapPose, Reference, Vec3
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
@@ -57,8 +57,8 @@ class Expectation(Record, frozen=True):
     """Command for the clamp; None to leave it as it is."""
     grip: Grip = Grip.FREE
     """What the vehicle has in its clamp, for the other vehicle of a team."""
-    lift_server_s: float | None = None
-    """Time on the motion-capture server's clock at which the bar is lifted, if this vehicle sets it."""
+    together: Together = Together()
+    """When both vehicles of a team begin to move the bar, if this vehicle sets it."""
     bar: HeldBar | None = None
     """The bar whose end the clamp holds; None if it holds nothing."""
     carry: CarryState | None = None
@@ -115,6 +115,7 @@ class Air:
         safe: the governor's safe set.
         nominal: whether the supervisor has not reacted to anything so far.
         holds: whether it has reacted by a hold or more; a mere warning stops no plan.
+        waits: whether it holds only until the other vehicle of a team may go on, too.
     """
 
     def __init__(
@@ -129,6 +130,7 @@ class Air:
         safe: SafeSet,
         nominal: bool,
         holds: bool = False,
+        waits: bool = False,
     ) -> None:
         self.o = o
         self.i = o.inputs
@@ -143,6 +145,7 @@ class Air:
         self.safe = safe
         self.nominal = nominal
         self.holds = holds
+        self.waits = waits
         self.skips_rest = False
         """Whether the phases that follow and need the state of this one are skipped when it ends."""
 
@@ -154,6 +157,10 @@ class Air:
         x, y, z = quat_rotate(pose.attitude_wxyz, self.manipulator.net_body_m(arm.angle_rad))
         px, py, pz = pose.position_world_m
         return (px + x, py + y, pz + z)
+
+    def plan_s(self) -> float:
+        """Return the plan's time since the start of the phase whose state it is."""
+        raise NotImplementedError
 
     def plan_reference(self) -> Reference:
         """Return the plan's reference, without what the phase adds."""
@@ -167,10 +174,14 @@ class Air:
         """Report a failure: the flight counts as aborted, and the plan's time stops until the state ends."""
         raise NotImplementedError
 
+    def resume(self, notice: EventDefinition, text: str) -> None:
+        """End the hold, if the operator has said so to every vehicle that has begun one, and report it."""
+        raise NotImplementedError
+
     def stay(self, segment: Segment) -> None:
         """Keep the plan's time before the end of a segment."""
         raise NotImplementedError
 
     def move_to(self, plan_s: float) -> None:
-        """Move the plan's time to a start or an end of a segment, where the plan is at rest."""
+        """Move the plan's time to a start or an end of a segment, where the plan is at rest, or to any place of it during a hold."""
         raise NotImplementedError

@@ -50,12 +50,22 @@ class Grip(Enum):
     __hash__ = object.__hash__
 
 
+class Together(Record, frozen=True, kw_only=True):
+    """What two members need to begin a motion of the bar at one instant: the lift, and what follows a hold."""
+
+    go_server_s: float | None = None
+    """Time on the motion-capture server's clock at which both begin; None until the left member has set it."""
+    plan_s: float = 0.0
+    """Plan time since the start of the phase: a hold stops the two at slightly different places of their plans."""
+    waits: bool = False
+    """Whether it holds only because the other does, or has been resumed, and goes on as soon as the other may, too."""
+
+
 class TeamState(Record, frozen=True, kw_only=True):
     """What a member of the team announces 50 times a second."""
 
     grip: Grip
-    lift_server_s: float | None = None
-    """Time on the motion-capture server's clock at which both lift the bar; None until the left member has set it."""
+    together: Together = Together()
     holds: bool
     """Whether it has stopped where it is, or does more than that."""
     lands: bool

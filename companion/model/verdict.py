@@ -20,6 +20,7 @@ class Answer(Enum):
     ALREADY_HOLDING = "already_holding"
     TOO_LOW_TO_HOLD = "too_low_to_hold"
     CONTINUING = "continuing"
+    CONTINUING_TOGETHER = "continuing_together"
     LANDING_CONTINUES = "landing_continues"
     LANDING = "landing"
     ABORTED = "aborted"

@@ -48,9 +48,13 @@ class Evaluation:
         """Make all active rules raise their events again, because the operator has ended the reaction to them."""
         self._active = {id_: active for id_, active in self._active.items() if active[1] == math.inf}
 
-    def standing(self) -> str | None:
-        """Return the message of the active rule with the most severe action, or None if no active rule requires HOLD or more."""
-        holding = [row for row in self.active() or () if row.action.rank >= SafetyAction.HOLD.rank]
+    def standing(self, besides: str | None = None) -> str | None:
+        """Return the message of the active rule with the most severe action, other than `besides`; None if none of them requires HOLD
+        or more.
+        """
+        holding = [
+            row for row in self.active() or () if row.action.rank >= SafetyAction.HOLD.rank and row.id != besides
+        ]
         return max(holding, key=lambda row: row.action.rank).text if holding else None
 
     def active(self) -> tuple[ActiveRule, ...] | None:

@@ -116,9 +116,11 @@ class Monitors:
         """Return the active rules, as of the last tick; None if there is none."""
         return self._evaluation.active()
 
-    def standing(self) -> str | None:
-        """Return the message of the most severe active rule, as of the last tick; None if no active rule requires HOLD or more."""
-        return self._evaluation.standing()
+    def standing(self, besides: str | None = None) -> str | None:
+        """Return the message of the most severe active rule other than `besides`, as of the last tick; None if none of them requires
+        HOLD or more.
+        """
+        return self._evaluation.standing(besides)
 
     def check(self, inputs: Inputs, context: FlightContext) -> tuple[Event, ...]:
         """Update with the inputs of one tick and return the new events."""

@@ -30,6 +30,7 @@ CRASHED: Final = "crashed"
 OPERATOR_START: Final = "operator_start"
 OPERATOR_RESUME: Final = "operator_resume"
 OPERATOR_LAND, OPERATOR_ABORT = "operator_land", "operator_abort"
+PARTNER_HOLDS: Final = "partner_holds"
 
 
 def _invalid(id_: str, field: str, what: str, message: str, on_lamp: Lamp) -> Rule:
@@ -226,7 +227,7 @@ RULES: tuple[Rule, ...] = (
         message="nothing from the other vehicle for more than {:.1f} s, and both hold the bar",
     ),
     Rule(
-        id="partner_holds", subject=Subject.PARTNER, what="the other vehicle, which holds the same bar, has stopped",
+        id=PARTNER_HOLDS, subject=Subject.PARTNER, what="the other vehicle, which carries the same bar, has stopped by itself",
         predicate=team.partner_holds, ground=None, air=_HOLD, message="the other vehicle holds",
     ),
     Rule(

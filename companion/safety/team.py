@@ -60,8 +60,10 @@ def partner_silent(t: TeamTracker, timeout_s: float) -> Values | None:
 
 
 def partner_holds(t: TeamTracker, _: None) -> Values | None:
-    """Fires if the other vehicle has stopped while both hold the bar."""
-    return HOLDS if t.said is not None and t.said.holds and t.grip in HELD else None
+    """Fires if the other vehicle has stopped, for a reason of its own, while both carry the bar."""
+    if t.said is None or not t.said.holds or t.said.together.waits:
+        return None
+    return HOLDS if t.grip is Grip.CARRYING else None
 
 
 def partner_lands(t: TeamTracker, _: None) -> Values | None:

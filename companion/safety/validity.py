@@ -164,8 +164,10 @@ def _bar_is_valid(b: BarPose) -> bool:
 
 
 def _partner_is_valid(p: PartnerState) -> bool:
-    lift_s = p.said.lift_server_s
-    return _stamp(p.stamp_s) and (lift_s is None or _stamp(lift_s)) and _in_range3(p.said.position_world_m)
+    go_s, plan_s = p.said.together.go_server_s, p.said.together.plan_s
+    return (
+        _stamp(p.stamp_s) and (go_s is None or _stamp(go_s)) and _stamp(plan_s) and _in_range3(p.said.position_world_m)
+    )
 
 
 def _arm_is_valid(a: ArmState) -> bool:

@@ -8,8 +8,9 @@ from __future__ import annotations
 import contextlib
 import gc
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Final
 
 from msgspec.structs import replace
@@ -65,7 +66,6 @@ from sitl.world.throws import with_throws
 START_S: Final = SIMULATED_START_S
 """World time at the first tick, as over the wires."""
 _NO_COMMAND: Final = OperatorCommand.NONE
-_LAND: Final = OperatorCommand.LAND
 _ON_GROUND: Final = LandedState.ON_GROUND
 _IN_AIR: Final = LandedState.IN_AIR
 _NO_REQUEST: Final = AutopilotRequest.NONE
@@ -133,7 +133,7 @@ class FastFlight:
 
     Args:
         config: effective configuration; the hover thrust is the stub's MPC_THR_HOVER if the vehicle file has none.
-        land_at_s: time on the flight clock at which the operator commands a landing; None for never.
+        commands: the operator's commands, by the time on the flight clock at which each is given.
         make_law: makes the control law in place of the configured one.
         scene: the scene of which this is machine `number`; None for a scene of its own.
         number: number of the machine.
@@ -142,7 +142,7 @@ class FastFlight:
     def __init__(
         self,
         config: SitlConfig,
-        land_at_s: float | None = None,
+        commands: Mapping[float, OperatorCommand] | None = None,
         make_law: MakeLaw | None = None,
         *,
         scene: Scene | None = None,
@@ -150,7 +150,7 @@ class FastFlight:
     ) -> None:
         config = with_fault_times(with_throws(config))
         vehicle, world, start = config.vehicle, config.world, config.mission.start
-        self._land_at_s = land_at_s
+        self._commands = sorted((commands or {}).items(), key=itemgetter(0))
         self.px4 = stub_of(world, vehicle.airframe, LINK_DELAY_S)
         servos = servos_of(vehicle, world)
         drives = [servo.drive for servo in servos]
@@ -464,7 +464,7 @@ class FastFlight:
         self._vehicle = vehicle
         if self._force is not None and math.isnan(self._force.stamp_s):
             self._force = replace(self._force, stamp_s=t_s)
-        land = self._land_at_s is not None and t_s >= self._land_at_s
+        due = bool(self._commands) and t_s >= self._commands[0][0]
         return Inputs(
             tick=tick,
             t_s=t_s,
@@ -473,7 +473,7 @@ class FastFlight:
             mocap=self._mocap,
             arm=self._bus.read(t_s),
             force=self._force,
-            command=_LAND if land else _NO_COMMAND,
+            command=self._commands.pop(0)[1] if due else _NO_COMMAND,
             recorder_dropped=dropped,
             guardian_ready=guardian_ready,
             estimator=self._telemetry.estimator(t_s) if self._external else None,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 from companion.model.team import PartnerState, TeamState
+from companion.model.types import OperatorCommand
 from companion.sitl_config.team import TeamConfig
 from sitl.fast.loop import FastFlight, FastResult, garbage_collection_paused
 from sitl.world.pair import pair_scene
@@ -30,12 +32,16 @@ class FastTeam:
 
     Args:
         config: configuration of both members.
+        commands: the operator's commands to each member, by time.
     """
 
-    def __init__(self, config: TeamConfig) -> None:
+    def __init__(self, config: TeamConfig, commands: Sequence[Mapping[float, OperatorCommand]] = ({}, {})) -> None:
         configs = [each for _, each in config.members]
         self.scene = pair_scene(configs)
-        self.flights = tuple(FastFlight(each, scene=self.scene, number=number) for number, each in enumerate(configs))
+        self.flights = tuple(
+            FastFlight(each, told, scene=self.scene, number=number)
+            for number, (each, told) in enumerate(zip(configs, commands, strict=True))
+        )
         self._links = (_Link(), _Link())
         """What each member has sent and the other has not received yet."""
 

@@ -8,7 +8,7 @@ import pytest
 
 from companion.control.hover_thrust import AIRBORNE_M
 from companion.model.frames import tilt_rad
-from companion.model.types import Outcome, PhaseKind, Vec3
+from companion.model.types import OperatorCommand, Outcome, PhaseKind, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight, FastResult
 from tests.support import SHORT_CATCH
@@ -136,7 +136,7 @@ def test_a_delay_that_makes_the_control_law_swing_is_reported_and_px4_lands() ->
 @pytest.mark.parametrize("at_s", [3.8, 8.0])
 def test_asked_to_land_it_lands(at_s: float) -> None:
     """In take-off, and in the landing."""
-    result = FastFlight(short(), land_at_s=at_s).run()
+    result = FastFlight(short(), {at_s: OperatorCommand.LAND}).run()
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert not result.crashed
     assert result.truth[-1].position_world_m[2] < 0.35

@@ -13,7 +13,7 @@ from companion.analysis.summary import summarise
 from companion.config.document import ConfigError
 from companion.config.loader import logged_flight
 from companion.core.flight_core import FlightCore
-from companion.model.types import Outcome, PhaseKind
+from companion.model.types import OperatorCommand, Outcome, PhaseKind
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight, FastResult
@@ -50,7 +50,7 @@ def test_the_catch_is_flown_without_the_part(absent: str) -> None:
 
 def test_without_a_tether_a_commanded_landing_and_a_gust_are_flown() -> None:
     gust = "world.faults=[{kind: gust, t_s: 4.5, duration_s: 0.5, size: 2.0}]"
-    result = FastFlight(load_sitl(SHORT_CATCH, overrides=[NO_TETHER, gust]), land_at_s=5.0).run()
+    result = FastFlight(load_sitl(SHORT_CATCH, overrides=[NO_TETHER, gust]), {5.0: OperatorCommand.LAND}).run()
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert not result.crashed
     assert all(o.tether is None for o in result.outputs)

@@ -18,14 +18,19 @@ from companion.io.protocols import DeviceError
 from companion.io.team_link import TeamLink, TeamSender, TeamSettings, decoded, direction, encoded
 from companion.model.codec import to_packet
 from companion.model.observations import LinkCounts
-from companion.model.team import Grip, TeamState
+from companion.model.team import Grip, TeamState, Together
 from companion.runtime.clock import flight_clock
 from tests.support import free_udp_port, wait_until
 
 KEY = bytes(range(32))
 LOOPBACK = "127.0.0.1"
 SAID = TeamState(
-    grip=Grip.READY, lift_server_s=12.25, holds=False, lands=False, px4_lands=False, position_world_m=(1.0, -0.5, 0.75)
+    grip=Grip.READY,
+    together=Together(go_server_s=12.25),
+    holds=False,
+    lands=False,
+    px4_lands=False,
+    position_world_m=(1.0, -0.5, 0.75),
 )
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.model.types import OperatorCommand
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from tests.recorder.flights import flight_of, record
@@ -16,7 +17,7 @@ from tests.support import SHORT_CATCH
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The log of a flight of the fast loop with a catch and a commanded landing, written by the recorder."""
     config = load_sitl(SHORT_CATCH)
-    result = FastFlight(config, land_at_s=8.7).run()
+    result = FastFlight(config, {8.7: OperatorCommand.LAND}).run()
     assert result.caught
     path = [o.reference.position_world_m for o in result.outputs if o.reference is not None][::40]
     return record(

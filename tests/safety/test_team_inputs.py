@@ -8,12 +8,17 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from companion.model.team import BarPose, ClampState, Grip, PartnerState, TeamState
+from companion.model.team import BarPose, ClampState, Grip, PartnerState, TeamState, Together
 from companion.model.types import Inputs, OperatorCommand
 from companion.safety.validity import InputFilter
 
 SAID = TeamState(
-    grip=Grip.READY, lift_server_s=8.0, holds=False, lands=False, px4_lands=False, position_world_m=(0.0, 1.0, 1.0)
+    grip=Grip.READY,
+    together=Together(go_server_s=8.0),
+    holds=False,
+    lands=False,
+    px4_lands=False,
+    position_world_m=(0.0, 1.0, 1.0),
 )
 RECORDS: dict[str, Any] = {
     "clamp": ClampState(1.0, 1.5),
@@ -40,7 +45,7 @@ def said(**values: Any) -> dict[str, Any]:
         ("bar", {"stamp_s": math.nan}),
         ("partner", {"stamp_s": math.nan}),
         ("partner", said(position_world_m=(0.0, 0.0, math.inf))),
-        ("partner", said(lift_server_s=math.nan)),
+        ("partner", said(together=Together(go_server_s=math.nan))),
     ],
 )
 def test_a_value_that_is_not_valid_makes_the_record_one_that_was_not_received(field: str, values: Any) -> None:

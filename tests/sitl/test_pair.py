@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import pytest
 
 from companion.model.team import Grip
-from companion.model.types import Outcome
+from companion.model.types import OperatorCommand, Outcome
+from companion.model.verdict import Answer
 from companion.sitl_config.team import load_team
 from sitl.fast.loop import FastResult
 from sitl.fast.team import FastTeam, TeamResult
@@ -13,8 +16,10 @@ from sitl.fast.team import FastTeam, TeamResult
 IDEAL = "ideal"
 
 
-def flown(*overrides: str, world: str = IDEAL) -> tuple[FastTeam, TeamResult]:
-    team = FastTeam(load_team("carry", [SHORT, *overrides], world=world))
+def flown(
+    *overrides: str, world: str = IDEAL, commands: Sequence[Mapping[float, OperatorCommand]] = ({}, {})
+) -> tuple[FastTeam, TeamResult]:
+    team = FastTeam(load_team("carry", [SHORT, *overrides], world=world), commands)
     return team, team.run()
 
 
@@ -51,6 +56,28 @@ def test_both_lift_carry_set_down_and_land() -> None:
         for member in result.members
     ]
     assert abs(lifts[0] - lifts[1]) <= 0.0051
+
+
+def test_a_hold_of_both_ends_at_one_instant_once_each_that_was_commanded_is_resumed() -> None:
+    """The right one holds because the left one does, and then because of its own command: to resume the left one is not enough."""
+    hold, resume = OperatorCommand.HOLD, OperatorCommand.RESUME
+    team, result = flown(commands=({19.0: hold, 20.0: resume}, {19.5: hold, 21.0: resume}))
+    assert outcomes(result) == [Outcome.COMPLETED, Outcome.COMPLETED]
+    assert [o.verdict.answer for o in result.members[0].outputs if o.verdict is not None] == [
+        Answer.HOLDING,
+        Answer.CONTINUING_TOGETHER,
+    ]
+    assert "partner_holds" in ids(result.members[1])
+    went_on = [[e.t_s for o in member.outputs for e in o.events if e.id == "goes_on"] for member in result.members]
+    assert [len(times) for times in went_on] == [1, 1]
+    assert went_on[0][0] > 21.0
+    assert abs(went_on[0][0] - went_on[1][0]) <= 0.0051
+    ends = [
+        next(o.t_s for o in member.outputs if o.team is not None and o.team.grip is Grip.STANDING)
+        for member in result.members
+    ]
+    assert abs(ends[0] - ends[1]) <= 0.0051, "both have continued at one place of their plans"
+    assert_both_down_unharmed(team)
 
 
 def test_jaws_that_close_beside_the_handle_try_again_beside_it() -> None:

@@ -20,10 +20,10 @@ from companion.model.algebra import dot, minus, plus, scaled
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import wrap_rad
-from companion.model.team import CarryState, ClampCommand, Grip
+from companion.model.team import CarryState, ClampCommand, Grip, TeamState, Together
 from companion.model.types import Reference, SafetyAction, Severity, Vec3
 from companion.phases.carry.bar import BarPose, body_in_bar_m, body_m, sign_of, turned_about_z, vehicle_yaw_rad
-from companion.phases.carry.grip import PARTNER_FRESH_S, GripHandle
+from companion.phases.carry.grip import LIFT_AFTER_S, PARTNER_FRESH_S, GripHandle, server_s
 from companion.safety.notices import EventDefinition
 
 FORCE_FILTER_S: Final = 0.1
@@ -37,6 +37,9 @@ BAR_LOST = EventDefinition(
     "bar_lost", Severity.CRITICAL, SafetyAction.LAND,
     "the weight of the lifted bar is not felt: the jaws have closed beside the handle, or it has slipped out of them",
 )  # fmt: skip
+GOES_ON = EventDefinition(
+    "goes_on", Severity.INFO, SafetyAction.NOMINAL, "both vehicles of a team continue after a hold, at one instant"
+)
 STAND_S: Final = 0.5
 """Time at the end of the way after which the bar stands."""
 SET_DOWN_M: Final = 0.03
@@ -96,6 +99,8 @@ class Carrying(Record, frozen=True, kw_only=True):
     """Fraction of `begun_offset_m` that is left."""
     light_s: float = math.inf
     """Flight clock since which the lifted bar weighs too little; infinite while it does not."""
+    together: Together = Together()
+    """When both go on after a hold."""
 
 
 class Carry(Phase):
@@ -169,7 +174,7 @@ class Carry(Phase):
     def step(self, air: Air, own: Any) -> Carrying | None:
         """Return the state after one tick; None when the bar stands and the other vehicle says so, too."""
         air.stay(air.engaged)
-        s: Carrying = own
+        s: Carrying = self._going_on(air, own)
         pose, along = self._bar(air)
         left = 1.0 - rest_to_rest(min(1.0, (air.t_s - s.begun_s) / self.lift_s))[0]
         s = self._yielding(air, replace(s, pose=pose, along_world=along, share=left))
@@ -215,6 +220,7 @@ class Carry(Phase):
             clamp=ClampCommand.CLOSE,
             grip=Grip.STANDING if s.stands else Grip.CARRYING,
             bar=s.bar,
+            together=s.together,
             carry=CarryState(
                 tension_n=s.tension_n,
                 weight_n=s.bar.weight_n,
@@ -223,6 +229,29 @@ class Carry(Phase):
                 centre_world_m=(x, y, z),
                 yaw_rad=yaw_rad,
             ),
+        )
+
+    def _going_on(self, air: Air, s: Carrying) -> Carrying:
+        """Return the state with what the other vehicle must know of a hold; end the hold at the instant that the left one sets."""
+        together = Together(plan_s=air.plan_s(), waits=air.waits)
+        if not (air.waits and (said := _fresh(air)) is not None and said.together.waits):
+            return replace(s, together=together)
+        left = grip_of(air.phases[: air.engaged.index]).end == "left"
+        now_s, go_s = server_s(air.i), s.together.go_server_s if left else said.together.go_server_s
+        if left and go_s is None:
+            go_s = now_s + LIFT_AFTER_S
+        if go_s is None or now_s < go_s:
+            return replace(s, together=replace(together, go_server_s=go_s))
+        before_m = air.plan_reference().position_world_m
+        if not left:
+            air.move_to(air.engaged.start_s + said.together.plan_s)
+        moved_m = minus(before_m, air.plan_reference().position_world_m)
+        air.resume(GOES_ON, "both vehicles continue")
+        return replace(
+            s,
+            together=Together(plan_s=air.plan_s()),
+            begun_s=air.t_s,
+            begun_offset_m=plus(scaled(s.begun_offset_m, s.share), moved_m),
         )
 
     def _yielding(self, air: Air, s: Carrying) -> Carrying:
@@ -272,13 +301,15 @@ def grip_of(phases: Sequence[Any]) -> GripHandle:
     return next(phase for phase in reversed(phases) if isinstance(phase, GripHandle))
 
 
-def _stands_there(air: Air) -> bool:
+def _fresh(air: Air) -> TeamState | None:
+    """Return the other vehicle's newest announcement; None if it is old."""
     partner = air.i.partner
-    return (
-        partner is not None
-        and air.t_s - partner.stamp_s <= PARTNER_FRESH_S
-        and partner.said.grip in (Grip.STANDING, Grip.FREE)
-    )
+    return None if partner is None or air.t_s - partner.stamp_s > PARTNER_FRESH_S else partner.said
+
+
+def _stands_there(air: Air) -> bool:
+    said = _fresh(air)
+    return said is not None and said.grip in (Grip.STANDING, Grip.FREE)
 
 
 def _turning(

@@ -19,7 +19,7 @@ from companion.mission.phase import Checking, Phase, Planning
 from companion.model.algebra import minus, plus, scaled
 from companion.model.codec import Record
 from companion.model.frames import quat_rotate
-from companion.model.team import ClampCommand, Grip
+from companion.model.team import ClampCommand, Grip, Together
 from companion.model.types import Inputs, Reference, SafetyAction, Severity, Vec3
 from companion.phases.carry.bar import (
     Bar,
@@ -203,7 +203,7 @@ class GripHandle(Phase):
         return Expectation(
             clamp=ClampCommand.CLOSE if s.closes else ClampCommand.OPEN,
             grip=Grip.READY if s.closed_s < math.inf else Grip.FREE,
-            lift_server_s=s.lift_server_s if self.end == "left" else None,
+            together=Together(go_server_s=s.lift_server_s if self.end == "left" else None),
             bar=self.held() if s.closes else None,
             back_m=self._back_m() if s.over_bar else None,
         )
@@ -266,7 +266,7 @@ class GripHandle(Phase):
         if self.end == "right":
             if partner.said.grip is Grip.CARRYING and s.lift_server_s is None:
                 return server_s(air.i)
-            return partner.said.lift_server_s or s.lift_server_s
+            return partner.said.together.go_server_s or s.lift_server_s
         if s.lift_server_s is None and partner.said.grip is Grip.READY:
             return server_s(air.i) + LIFT_AFTER_S
         return s.lift_server_s
