@@ -179,8 +179,8 @@ class TeamDevice(Model):
 
     port: Annotated[int, Field(ge=0, le=65535)] = 14700
     """UDP port at which this vehicle receives."""
-    partner: Ipv4Address = "127.0.0.1"
-    """Address of the other vehicle's computer."""
+    partner: Ipv4Address | None = None
+    """Address of the other vehicle's computer; with `--sitl`, this one's."""
     partner_port: Annotated[int, Field(gt=0, le=65535)] = 14700
     """UDP port at which the other vehicle receives."""
     key_file: str | None = None

@@ -48,7 +48,7 @@ class TeamSettings:
     """`devices.team` of the vehicle file, with the same keys."""
 
     port: int
-    partner: str
+    partner: str | None
     partner_port: int
     key_file: str | None
 
@@ -78,10 +78,14 @@ class TeamSender:
         settings: addresses and key.
 
     Raises:
-        DeviceError: the key is missing or too short, or there is no way to the other vehicle.
+        DeviceError: address or key is missing, the key is too short, or there is no way to the other vehicle.
     """
 
     def __init__(self, settings: TeamSettings) -> None:
+        if settings.partner is None:
+            raise DeviceError(
+                "devices.team.partner: missing; expected the IPv4 address of the other vehicle's computer"
+            )
         self.key, self._to = read_key(settings), (settings.partner, settings.partner_port)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -92,6 +96,7 @@ class TeamSender:
         except OSError as error:
             self.close()
             raise DeviceError(f"team {settings.partner}:{settings.partner_port}: {error.strerror}") from None
+        self.partner_ip = settings.partner
         self._direction = direction(self.own_ip, *self._to)
         self._counter = 0
         self._due_s = -math.inf
@@ -152,7 +157,7 @@ class TeamLink:
             used = "another program holds the port; close it or change devices.team.port"
             found = used if error.errno == errno.EADDRINUSE else error.strerror
             raise DeviceError(f"team {sender.own_ip}:{settings.port}: {found}") from None
-        self._direction = direction(settings.partner, *self._socket.getsockname())
+        self._direction = direction(sender.partner_ip, *self._socket.getsockname())
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -175,7 +180,7 @@ class TeamLink:
     def newest(self) -> PartnerState | None:
         """Return the newest announcement of the other vehicle that has arrived, or None before the first. Never waits."""
         for datagram in sockets.waiting(self._socket):
-            if datagram.sender_ip != self._settings.partner:
+            if datagram.sender_ip != self._sender.partner_ip:
                 self._count("foreign")
             elif isinstance(found := decoded(datagram.data, self._sender.key, self._direction), str):
                 self._count(found)

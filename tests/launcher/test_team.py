@@ -14,7 +14,8 @@ from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, 
 from tests.support import PREFLIGHT, ROOT, Sandbox, read_summary, set_options
 
 TEAM = ROOT / "configs/teams/carry.yaml"
-FAST = set_options(**{PREFLIGHT: 1.0, "vehicle.ground.mqtt": None})
+SHORT = {"mission.phases[2].waypoints": [{"position_m": [-0.7, 0.0], "yaw_deg": 80.0}]}
+FAST = set_options(**{PREFLIGHT: 1.0, "vehicle.ground.mqtt": None}, **SHORT)
 FLY = ("team", "fly", TEAM, "--sitl", "--speed", "max", "--out", "out", *FAST)
 
 
@@ -41,8 +42,16 @@ FLY = ("team", "fly", TEAM, "--sitl", "--speed", "max", "--out", "out", *FAST)
             "this vehicle flies alone: fly a team file with `companion team fly`",
         ),
         (("fly", TEAM, "--member", "left", "--sitl", "--out", "out"), "in the simulated world both fly"),
+        (
+            ("fly", TEAM, "--member", "left", "--out", "out"),
+            "members.left: vehicle.devices.team.partner: missing; expected the IPv4 address",
+        ),
+        (
+            ("check", TEAM, "--member", "right", "--set", "vehicle.devices.team.partner=127.0.0.2"),
+            "members.right: vehicle.devices.team.key_file: missing",
+        ),
     ],
-    ids=["one body", "hardware", "px4 as a word", "px4", "misspelt", "speed", "alone", "member"],
+    ids=["one body", "hardware", "px4 as a word", "px4", "misspelt", "speed", "alone", "member", "partner", "key"],
 )
 def test_bad_input_is_one_line_and_nothing_is_started(
     sandbox: Sandbox, arguments: tuple[object, ...], said: str
@@ -56,9 +65,11 @@ def test_bad_input_is_one_line_and_nothing_is_started(
 
 def test_on_the_vehicle_each_member_flies_its_own_end(sandbox: Sandbox) -> None:
     """Nothing answers there: the flight is refused, with the member's configuration in its folder."""
+    (sandbox.cwd / "team.key").write_bytes(bytes(range(32)))
     for end, number in (("left", 1), ("right", 2)):
         here = {"server": "127.0.0.1", "interface": "127.0.0.1", "transport": "unicast", "command_port": 9}
-        options = set_options(**{f"vehicle.devices.mocap.{key}": value for key, value in here.items()})
+        link = {"vehicle.devices.team.partner": "127.0.0.1", "vehicle.devices.team.key_file": "team.key"}
+        options = set_options(**{f"vehicle.devices.mocap.{key}": value for key, value in here.items()}, **link)
         ended = sandbox.run("fly", TEAM, "--member", end, "--out", end, *options)
         assert ended.code != EXIT_BAD_INPUT, ended
         config = json.loads((sandbox.cwd / end / "config.json").read_text(encoding="utf-8"))
