@@ -127,16 +127,13 @@ def _load(arguments: argparse.Namespace, *, hardware: bool, real_px4: bool = Fal
             raise ConfigError([f"companion {arguments.command}: --member {arguments.member}: {text}"])
         law, preset = arguments.controller, arguments.preset
         team = load_team(
-            arguments.mission, arguments.overrides, controller_law=law, preset=preset, hardware=True, world=world
+            arguments.mission,
+            arguments.overrides,
+            controller_law=law,
+            preset=preset,
+            on_hardware=arguments.member,
+            world=world,
         )
-        link = dict(team.members)[arguments.member].vehicle.devices.team
-        for key, what in (
-            ("partner", "the IPv4 address of the other vehicle's computer"),
-            ("key_file", "a file; docs/team.md"),
-        ):
-            if link is not None and getattr(link, key) is None:
-                text = f"members.{arguments.member}: vehicle.devices.team.{key}: missing; expected {what}"
-                raise ConfigError([f"{team.source}: {text}"])
         return dict(team.members)[arguments.member]
     return load_sitl(
         arguments.mission,

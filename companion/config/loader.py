@@ -105,7 +105,7 @@ def load_flight(
     if vehicle_file is not None:
         vehicle = _check_vehicle(vehicle_file, parsed, of_vehicle)
         if hardware and vehicle is not None:
-            of_vehicle += _open_to_every_network(vehicle, vehicle_file) + _unusable_devices(vehicle, vehicle_file)
+            of_vehicle += _missing_on_hardware(vehicle, vehicle_file) + _unusable_devices(vehicle, vehicle_file)
     _place_arm(mission_file, vehicle)
     mission = validated(Mission, mission_file, lines)
     lines += of_vehicle
@@ -249,17 +249,29 @@ def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
             document.report(place, text)
 
 
-def _open_to_every_network(vehicle: Vehicle, document: Document) -> list[str]:
-    """Return a message if motion capture is received from every network, where any sender could use Motive's address; else nothing."""
-    interface = vehicle.devices.mocap.interface
-    if interface != ANY_INTERFACE or vehicle.devices.mocap.external:
-        return []
-    location = ("devices", "mocap", "interface")
-    text = (
-        f'{key_path(location)}: expected the address of this computer on the camera network, got "{interface}" (every network); '
-        "`ip -4 address` shows it, `companion mocap check` proposes it; flights with --sitl do not need it"
+def _missing_on_hardware(vehicle: Vehicle, document: Document) -> list[str]:
+    """Return messages if motion capture is received from every network, where any sender could use Motive's address, or nothing says
+    where the other vehicle of a team is and with which key it signs.
+    """
+    found: list[tuple[Location, str]] = []
+    mocap, link = vehicle.devices.mocap, vehicle.devices.team
+    if mocap.interface == ANY_INTERFACE and not mocap.external:
+        text = f'expected the address of this computer on the camera network, got "{mocap.interface}" (every network); '
+        text += "`ip -4 address` shows it, `companion mocap check` proposes it"
+        found.append((("devices", "mocap", "interface"), text))
+    if link is not None and link.partner is None:
+        text = "missing; expected the IPv4 address of the other vehicle's computer"
+        found.append((("devices", "team", "partner"), text))
+    if link is not None and link.key_file is None:
+        found.append(
+            (("devices", "team", "key_file"), "missing; expected the file of the key that both vehicles share")
+        )
+    return problem_lines(
+        [
+            Problem(RANK_VALUE, document.origin(at), f"{key_path(at)}: {text}; flights with --sitl do not need it")
+            for at, text in found
+        ]
     )
-    return problem_lines([Problem(RANK_VALUE, document.origin(location), text)])
 
 
 def _unusable_devices(vehicle: Vehicle, document: Document) -> list[str]:

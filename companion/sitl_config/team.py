@@ -46,7 +46,7 @@ def load_team(
     *,
     controller_law: str | None = None,
     preset: str | None = None,
-    hardware: bool = False,
+    on_hardware: End | None = None,
     world: str = TEAM_WORLD,
 ) -> TeamConfig:
     """Read a team file and all files that it names, and check them.
@@ -56,7 +56,7 @@ def load_team(
         overrides: `--set` options for both members, or for one of them with `left.` or `right.` in front, after those of the file.
         controller_law: as in `load_flight`, for both members.
         preset: as in `load_flight`, for both members.
-        hardware: as in `load_flight`.
+        on_hardware: the member that this computer flies on hardware, with what only hardware needs; None in simulation.
         world: name of a built-in world, or path of a file.
 
     Raises:
@@ -85,7 +85,7 @@ def load_team(
                 controller_law or (None if member.controller is None else str(folder / member.controller)),
                 preset,
                 own,
-                hardware=hardware,
+                hardware=end == on_hardware,
                 world=world,
             )
         except ConfigError as error:

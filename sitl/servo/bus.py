@@ -259,7 +259,7 @@ class ServoBus:
         self.dropped_bytes = 0
         """Bytes of answers that were dropped because the line was not read."""
         self.damaged: Callable[[], bool] = lambda: False
-        """Fault: called at every instruction; returns whether noise corrupts it."""
+        """Fault: called for the instructions that arrive at once; returns whether noise corrupts a byte of them."""
         self.answers_late_s = 0.0
         """Fault: additional delay of every answer; not in simulated time, in which a transmission takes no time."""
         self._wire_time = wire_time

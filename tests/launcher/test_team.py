@@ -16,6 +16,7 @@ from tests.support import PREFLIGHT, ROOT, Sandbox, read_summary, set_options
 TEAM = ROOT / "configs/teams/carry.yaml"
 SHORT = {"mission.phases[2].waypoints": [{"position_m": [-0.7, 0.0], "yaw_deg": 80.0}]}
 FAST = set_options(**{PREFLIGHT: 1.0, "vehicle.ground.mqtt": None}, **SHORT)
+INTERFACE = "vehicle.devices.mocap.interface=127.0.0.1"
 FLY = ("team", "fly", TEAM, "--sitl", "--speed", "max", "--out", "out", *FAST)
 
 
@@ -43,12 +44,23 @@ FLY = ("team", "fly", TEAM, "--sitl", "--speed", "max", "--out", "out", *FAST)
         ),
         (("fly", TEAM, "--member", "left", "--sitl", "--out", "out"), "in the simulated world both fly"),
         (
-            ("fly", TEAM, "--member", "left", "--out", "out"),
-            "members.left: vehicle.devices.team.partner: missing; expected the IPv4 address",
+            (
+                "fly",
+                TEAM,
+                "--member",
+                "left",
+                "--out",
+                "out",
+                "--set",
+                INTERFACE,
+                "--set",
+                "vehicle.devices.team.key_file=k",
+            ),
+            "devices.team.partner: missing; expected the IPv4 address of the other vehicle's computer",
         ),
         (
-            ("check", TEAM, "--member", "right", "--set", "vehicle.devices.team.partner=127.0.0.2"),
-            "members.right: vehicle.devices.team.key_file: missing",
+            ("check", TEAM, "--member", "right", "--set", INTERFACE, "--set", "vehicle.devices.team.partner=127.0.0.2"),
+            "devices.team.key_file: missing; expected the file of the key",
         ),
     ],
     ids=["one body", "hardware", "px4 as a word", "px4", "misspelt", "speed", "alone", "member", "partner", "key"],
