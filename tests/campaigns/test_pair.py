@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.support import run_here
 
-SHORT = "mission.phases[2].waypoints=[{position_m: [-0.9, 0.0]}]"
+SHORT = "mission.phases[2].waypoints=[{position_m: [-0.95, 0.0]}]"
 
 
 def test_a_team_is_flown_in_drawn_laboratories_and_its_rows_carry_the_figures_of_the_bar(tmp_path: Path) -> None:

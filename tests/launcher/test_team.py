@@ -14,10 +14,16 @@ from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, 
 from tests.support import PREFLIGHT, ROOT, Sandbox, read_summary, set_options
 
 TEAM = ROOT / "configs/teams/carry.yaml"
-SHORT = {"mission.phases[2].waypoints": [{"position_m": [-0.7, 0.0], "yaw_deg": 80.0}]}
+SHORT = {
+    "mission.phases[1].lower_s": 1.5,
+    "mission.phases[2].lift_m": 0.25,
+    "mission.phases[2].lift_s": 2.5,
+    "mission.phases[2].waypoints": [{"position_m": [-0.85, 0.0], "yaw_deg": 85.0}],
+}
+"""There, a turn, and no way back."""
 FAST = set_options(**{PREFLIGHT: 1.0, "vehicle.ground.mqtt": None}, **SHORT)
 INTERFACE = "vehicle.devices.mocap.interface=127.0.0.1"
-FLY = ("team", "fly", TEAM, "--sitl", "--speed", "max", "--out", "out", *FAST)
+FLY = ("team", "fly", TEAM, "--sitl", "--world", "ideal", "--speed", "max", "--out", "out", *FAST)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +151,7 @@ def test_a_killed_flight_process_lands_both(sandbox: Sandbox) -> None:
 
 def test_ctrl_c_lands_both(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY, "--no-report") as running:
-        running.wait_for("left    t   3.0")
+        running.wait_for("take-off\n")
         running.signal(signal.SIGINT)
         ended = running.end()
     sandbox.assert_nobody_left()
