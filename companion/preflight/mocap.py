@@ -192,6 +192,8 @@ def _body(stream: MocapStream, vehicle: Vehicle) -> Row:
     name = f' "{stream.body_name}"' if stream.body_name else ""
     if not others:
         return BODY.good(f"id {number}{name}, no other", f"id {number}")
+    if vehicle.devices.team is not None and len(others) == 1:
+        return BODY.good(f"id {number}{name}, and {others[0]}, the other vehicle's", f"id {number} and one more")
     fix = "make sure that this is the vehicle's body; disable the others in Motive, or change their shape"
     return BODY.bad(f"id {number}{name}, and others: {', '.join(map(str, others))}", f"id {number} alone", fix)
 

@@ -429,6 +429,13 @@ def test_a_bar_in_the_stream_passes_and_is_not_taken_for_another_body() -> None:
     assert rows["mocap.bar"].ok and rows["mocap.body"].ok
 
 
+@pytest.mark.parametrize(("others", "ok"), [((2,), True), ((2, 7), False)])
+def test_the_other_vehicle_of_a_team_is_no_body_to_disable(others: tuple[int, ...], ok: bool) -> None:
+    team = {**WITH_BAR, "devices.team": {}}
+    rows = judged(Case("", "", "", {"mocap_stream": r.stream(other_bodies=(3, *others))}, vehicle=team))
+    assert rows["mocap.body"].ok == ok
+
+
 def test_observations_of_nothing_refuse_and_do_not_fall_over() -> None:
     rows = evaluation.rows(Observations(start_s=0.0, duration_s=5.0), r.config())
     assert {"px4.heartbeat", "px4.vision", "mocap.device", "force.device"} <= {row.id for row in rows if row.refuses}
