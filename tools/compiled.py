@@ -58,6 +58,7 @@ COMPILED = (
     "sitl/faults/injector.py",
     "sitl/fast/*.py",
     "sitl/force_torque.py",
+    "sitl/mocap.py",
     "sitl/plant.py",
     "sitl/servo/*.py",
     "sitl/world/**/*.py",

@@ -56,7 +56,8 @@ from sitl.fast.telemetry import FastTelemetry
 from sitl.faults.injector import Faults
 from sitl.faults.timing import with_fault_times
 from sitl.force_torque import TIME_EPSILON_S, overloaded, quantised
-from sitl.plant import MocapFrame, Plant
+from sitl.mocap import MocapFrame
+from sitl.plant import Plant
 from sitl.servo.from_config import plugged_in, servos_of
 from sitl.world.scene import Scene
 from sitl.world.start import start_of
@@ -160,7 +161,7 @@ class FastFlight:
         self.plant = Plant(vehicle, world, self.px4, drives, pose, jaws=jaws, scene=scene, number=number)
         self.faults = Faults(world, self.plant.scene, self.plant.machine, self.px4, drives, vehicle.tether)
         if world.faults:
-            self.plant.faults = self.faults
+            self.plant.inject(self.faults)
         self._guardian = FastGuardian(vehicle, self.px4) if world.faults else None
         self._link = FastLink(self.faults, self.plant.scene, self.px4, TICK_PERIOD_S)
         hover = set_hover_thrust(self.px4, world, self.plant.machine)
@@ -256,7 +257,7 @@ class FastFlight:
         """Do everything that is due after a step of the scene; return the outputs of a control tick, if one was due."""
         plant = self.plant
         scene = plant.scene
-        plant.sense()
+        plant.mocap.sense()
         if self.over:
             return None
         if self._landing is not None or self._opens_s < math.inf:
@@ -316,7 +317,7 @@ class FastFlight:
         plant = self.plant
         if plant.faults is not None:
             self._bus.step(plant.scene.t_s)
-        for frame in plant.take_mocap()[-1:]:  # of frames that wait, the driver delivers the newest
+        for frame in plant.mocap.take()[-1:]:  # of frames that wait, the driver delivers the newest
             self._deliver(frame)
         if self._force_period_s is not None and plant.scene.t_s >= self._force_due_s - TIME_EPSILON_S:
             self._force_due_s += self._force_period_s
@@ -396,7 +397,7 @@ class FastFlight:
 
     def _poses_for_guardian(self) -> list[MocapPose]:
         """Return the poses of this step; none if another program sends them to PX4 itself, which it does here."""
-        frames = self.plant.take_mocap()
+        frames = self.plant.mocap.take()
         if not self._external:
             return [self._pose(frame) for frame in frames]
         for frame in frames:

@@ -22,7 +22,7 @@ from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.campaigns.flights import log_of
 from sitl.external_vision import ExternalVision
 from sitl.fast.loop import FastFlight, FastResult
-from sitl.plant import MocapFrame
+from sitl.mocap import MocapFrame
 from tests.sitl.px4_rig import Rig
 from tests.support import DEADLINE_S, HOVER, HOVERS_S, LOW_HOVER, SHORT_CATCH
 
