@@ -19,7 +19,7 @@ from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import Push, Servo
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.types import Battery, ImuSample, RotorCommands
-from sitl.faults.injector import Faults
+from sitl.faults.injector import CELL_FULL_V, Faults
 from sitl.mocap import Mocap
 from sitl.servo.from_config import torque_constants_nm_a
 from sitl.world.effects.force_sensor import ForceSensor
@@ -34,7 +34,6 @@ from sitl.world.state import PHYSICS_DT_S, Truth
 
 IMU_EVERY: Final = 2
 """Physics steps per IMU sample: 250 Hz, the rate of PX4's rate loop."""
-CELL_FULL_V: Final = 4.15
 CELL_EMPTY_V: Final = 3.5
 _COUNTS_PER_RAD = 4096.0 / (2.0 * math.pi)
 
