@@ -126,8 +126,8 @@ class FastFlight:
         """Time at which the guardian that has decided to land takes over, and its landing; infinite and None without one."""
         self._lands_s = 0.0
         """Time of the newest record of a landing without the flight process."""
-        self._settles_until_s: float | None = None
-        """Time until which PX4 may finish a landing; None before the flight has ended."""
+        self._settles_until_s = math.inf
+        """Time until which PX4 may finish a landing; infinite before the flight has ended."""
         self.over = False
         """Whether the flight has ended and `result` is complete."""
 
@@ -184,7 +184,7 @@ class FastFlight:
         if self._landing is not None or self._opens_s < math.inf:
             self._guardian_lands()
             return None
-        if self._settles_until_s is not None:
+        if self._settles_until_s < math.inf:
             self._settle()
             return None
         self._receive()
@@ -198,7 +198,7 @@ class FastFlight:
             return None
         self._period += 1
         outputs = self._tick()
-        if not self.over and self._settles_until_s is None and scene.t_s >= self._limit_s:
+        if not self.over and self._settles_until_s == math.inf and scene.t_s >= self._limit_s:
             self._end()
         return outputs
 
@@ -272,7 +272,6 @@ class FastFlight:
         self._force = ForceSample(stamp_s=math.nan, force_sensor_n=force, torque_sensor_nm=torque, overload=overload)
 
     def _settling(self) -> bool:
-        assert self._settles_until_s is not None
         return self.px4.armed and not self.plant.machine.crashed and self.plant.scene.t_s < self._settles_until_s
 
     def _settle(self) -> None:
