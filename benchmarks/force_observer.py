@@ -14,7 +14,8 @@ import numpy.typing as npt
 
 from companion.model.types import PhaseKind
 from companion.sitl_config.loader import load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 
 MISSIONS = Path(__file__).parents[1] / "configs" / "missions"
 FLIGHTS = (("hover", 0.0), ("circuit", 0.0), ("catch", 0.0), ("catch", 0.1), ("catch", 0.2), ("catch", 0.3))

@@ -12,7 +12,7 @@ from typing import Self
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.model.frames import attitude_ned_frd_from_enu_flu, euler_zyx_from_quat, ned_from_enu
-from sitl.plant import MocapFrame
+from sitl.mocap import MocapFrame
 from sitl.udp import Address, UdpEndpoint
 
 _COVARIANCE_FROM_PARAMS = [math.nan] * 21

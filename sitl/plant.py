@@ -6,31 +6,27 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from typing import Final, NamedTuple, Protocol
 
 from companion.config.arm import Joint
 from companion.config.vehicle import Vehicle
 from companion.model.algebra import scaled
-from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_normalize
-from companion.model.types import Quat, Vec3
+from companion.model.types import Vec3
 from companion.sitl_config.distributions import with_model_error
 from companion.sitl_config.faults import Fault, FaultKind
 from companion.sitl_config.per_joint import of_joints
 from companion.sitl_config.world import Push, Servo
 from companion.sitl_config.world import World as WorldConfig
 from sitl.autopilot.types import Battery, ImuSample, RotorCommands
-from sitl.faults.injector import Faults
+from sitl.faults.injector import CELL_FULL_V, Faults
+from sitl.mocap import Mocap
 from sitl.servo.from_config import torque_constants_nm_a
-from sitl.world.ball_markers import BallMarkers
 from sitl.world.effects.force_sensor import ForceSensor
 from sitl.world.effects.imu import ImuErrors
-from sitl.world.effects.mocap import MocapErrors
 from sitl.world.effects.transmission import Transmission, transmissions_of
 from sitl.world.handling import Handling, HungWeight
 from sitl.world.jaws import Jaws
-from sitl.world.mocap_misalignment import MocapMisalignment
 from sitl.world.noise import noise
 from sitl.world.scene import Scene
 from sitl.world.start import MachineSpec, Start
@@ -38,7 +34,6 @@ from sitl.world.state import PHYSICS_DT_S, Truth
 
 IMU_EVERY: Final = 2
 """Physics steps per IMU sample: 250 Hz, the rate of PX4's rate loop."""
-CELL_FULL_V: Final = 4.15
 CELL_EMPTY_V: Final = 3.5
 _COUNTS_PER_RAD = 4096.0 / (2.0 * math.pi)
 
@@ -76,22 +71,6 @@ class _JointServo(NamedTuple):
     """Indices of the joint in qpos and qvel."""
 
 
-class MocapFrame(NamedTuple):
-    """One motion-capture frame, which the server sends `mocap_latency_s` after its exposure."""
-
-    number: int
-    exposure_t_s: float
-    position_world_m: Vec3
-    attitude_wxyz: Quat
-    valid: bool
-    network_s: float
-    """Time for which the network holds the frame after its transmission."""
-    markers: tuple[Vec3, ...] = ()
-    """Markers that belong to no rigid body, in any order; if the ball is a rigid body, that body alone while it is tracked."""
-    bar: tuple[Vec3, Quat] | None = None
-    """Pose of the bar that two vehicles carry; None without one."""
-
-
 def _zero_rad(joint: Joint, servo: Servo) -> float:
     """Return the shaft angle at joint angle 0."""
     return joint.zero_count / _COUNTS_PER_RAD + joint.sign * math.radians(servo.zero_error_deg)
@@ -102,8 +81,8 @@ def battery_voltage_v(remaining: float, cells: int) -> float:
     return cells * (CELL_EMPTY_V + (CELL_FULL_V - CELL_EMPTY_V) * remaining)
 
 
-_MOCAP, _IMU, _FORCE = range(3)
-_IMU_DRIFT, _BAR = 11, 12
+_IMU, _FORCE, _IMU_DRIFT = 1, 2, 11
+"""Second part of the seed of each sensor's noise."""
 
 
 class Plant:
@@ -115,7 +94,7 @@ class Plant:
         px4: the autopilot.
         drives: motor of each joint.
         start: pose of the vehicle at the start.
-        between_steps: whether the cameras expose at the exact time between physics steps instead of at the end of a step.
+        between_steps: as in `Mocap`.
         jaws: motor of the clamp's servo; None without a clamp.
         scene: the scene of which this is machine `number`; None for a scene of its own.
     """
@@ -133,7 +112,6 @@ class Plant:
         scene: Scene | None = None,
         number: int = 0,
     ) -> None:
-        self._between_steps = between_steps
         joints = vehicle.arm.joints
         config = with_model_error(config, len(joints))
         self._config = config
@@ -176,13 +154,9 @@ class Plant:
             self.machine.add_joint_inertia(transmissions)
         hover_n = self.machine.weight_n / self.machine.rotor_count
         self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, hover_n, vehicle.airframe.rotor_layout)
-        self._mocap_errors = MocapErrors.of(config.mocap, config.seed)
         ball = vehicle.devices.mocap.ball
-        self._ball_is_body = ball is not None and ball.kind == "body"
-        self._markers = None if ball is None else BallMarkers(config, self.scene)
+        self.mocap = Mocap(config, ball, self.scene, self.machine, between_steps=between_steps)
         self._seed_noise()
-        self._mocap_noise_rad = math.radians(config.mocap_noise_deg)
-        self._misalignment = MocapMisalignment.of(config)
         self._handling = Handling(config, self.machine.weight_n) if config.handling else None
         self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
         self.force_is_read = True
@@ -191,11 +165,6 @@ class Plant:
         self._rotors: RotorCommands = (0.0,) * self.machine.rotor_count
         self._tick = 0
         self._imu_sample: ImuSample | None = None
-        self._mocap_queue: deque[tuple[float, MocapFrame]] = deque()
-        self._mocap_next_s = 0.0
-        self._mocap_number = 0
-        self._mocap_arrives_s = 0.0
-        """World time at which the newest frame arrives."""
         self.armed_t_s: float | None = None
         self.faults: Faults | None = None
         """Faults of this world; None if there are none."""
@@ -204,10 +173,13 @@ class Plant:
         """Start one noise sequence per sensor. The sequences restart at arming, so that the noise in flight depends only on the seed,
         not on the time before arming or on the reading of other sensors.
         """
-        self._mocap_noise, self._imu_noise, self._force_noise, self._bar_noise = (
-            noise(self._config.seed, sensor) for sensor in (_MOCAP, _IMU, _FORCE, _BAR)
-        )
+        seed = self._config.seed
+        self._imu_noise, self._force_noise = noise(seed, _IMU), noise(seed, _FORCE)
         self.machine.restart_noise()
+
+    def inject(self, faults: Faults) -> None:
+        """Let the faults of this world act on what the machine does and measures."""
+        self.faults = self.mocap.faults = faults
 
     @property
     def t_s(self) -> float:
@@ -241,7 +213,7 @@ class Plant:
         """Advance by one physics step."""
         self.act(armed)
         self.scene.step(armed)
-        self.sense()
+        self.mocap.sense()
 
     def act(self, armed: bool) -> None:
         """Set what acts on the machine in the next step of the scene."""
@@ -252,10 +224,7 @@ class Plant:
             self._seed_noise()
             if self._imu_errors is not None:
                 self._imu_errors.drift(noise(config.seed, _IMU_DRIFT))
-            if self._mocap_errors is not None:
-                self._mocap_errors.restart(t_s)
-            if self._markers is not None:
-                self._markers.restart(t_s)
+            self.mocap.restart(t_s)
             if machine.battery is not None:
                 machine.battery.restart()
         if self.faults is not None:
@@ -286,12 +255,6 @@ class Plant:
                 bar.closed[self.number] = self.jaws.closed
         machine.command(self._rotors, tuple(torques_nm))
 
-    def sense(self) -> None:
-        """Let the cameras see the machine after a step of the scene."""
-        scene = self.scene
-        if scene.t_s >= self._mocap_next_s - 1e-9:
-            self._expose_mocap(min(scene.t_s, self._mocap_next_s) if self._between_steps else scene.t_s)
-
     @property
     def imu_due(self) -> bool:
         """Whether the next step begins with an IMU sample."""
@@ -316,86 +279,6 @@ class Plant:
         p, q, r = rates
         ax, ay, az = force
         return ImuSample(self.scene.t_s, (p, -q, -r), (ax, -ay, -az))
-
-    def _expose_mocap(self, t_s: float) -> None:
-        config, machine = self._config, self.machine
-        faults, period_s, latency_s, valid = self.faults, 1.0 / config.mocap_rate_hz, config.mocap_latency_s, True
-        if faults is not None:
-            period_s = faults.mocap_period_s(period_s)
-            latency_s += faults.size("mocap_latency")
-        self._mocap_next_s += period_s
-        self._mocap_number += 1
-        x, y, z, qw, qx, qy, qz = machine.q[0:7]
-        since_s = self.scene.t_s - t_s
-        if since_s > 0.0:  # at most a step
-            vx, vy, vz, wx, wy, wz = machine.v[0:6]
-            x, y, z = x - since_s * vx, y - since_s * vy, z - since_s * vz
-            back = (1.0, -0.5 * since_s * wx, -0.5 * since_s * wy, -0.5 * since_s * wz)
-            qw, qx, qy, qz = quat_normalize(quat_multiply((qw, qx, qy, qz), back))
-        if self._mocap_errors is not None:
-            (x, y, z), (qw, qx, qy, qz), valid = self._mocap_errors.pose(t_s, (x, y, z), (qw, qx, qy, qz))
-        noise_m, noise_rad = config.mocap_noise_m, self._mocap_noise_rad
-        nx, ny, nz = next(self._mocap_noise)
-        roll, pitch, yaw = next(self._mocap_noise)
-        turned = quat_from_euler_zyx(noise_rad * roll, noise_rad * pitch, noise_rad * yaw)
-        position: Vec3 = (x + noise_m * nx, y + noise_m * ny, z + noise_m * nz)
-        attitude = quat_multiply((qw, qx, qy, qz), turned)
-        if faults is not None:
-            position, attitude, visible = faults.pose(position, attitude)
-            valid = valid and visible
-        if self._misalignment is not None:
-            position, attitude = self._misalignment.pose(position, attitude)
-        sent_s = t_s + latency_s
-        if self._mocap_errors is not None:
-            sent_s = self._mocap_errors.sent_s(sent_s)
-        arrives_s = sent_s
-        if faults is not None:
-            arrives_s = max(
-                sent_s + faults.size("mocap_network"), self._mocap_arrives_s
-            )  # the network keeps their order
-            self._mocap_arrives_s = arrives_s
-        markers: tuple[Vec3, ...] = ()
-        if self._markers is not None:
-            markers = self._markers.frame(t_s, since_s, ball_is_body=self._ball_is_body)
-            if self._misalignment is not None:
-                markers = tuple([self._misalignment.position(marker) for marker in markers])
-        bar = None if self.scene.bar is None else self.scene.bar.streamed(noise_m, next(self._bar_noise))
-        self._mocap_queue.append(
-            (
-                arrives_s,
-                MocapFrame(
-                    number=self._mocap_number,
-                    exposure_t_s=t_s,
-                    position_world_m=position,
-                    attitude_wxyz=attitude,
-                    valid=valid,
-                    network_s=arrives_s - sent_s,
-                    markers=markers,
-                    bar=bar,
-                ),
-            )
-        )
-
-    def take_mocap(self) -> list[MocapFrame]:
-        """Return and remove the frames that have arrived by now."""
-        return [frame for _, frame in self.mocap_until(self.scene.t_s)]
-
-    def mocap_until(self, until_s: float) -> list[tuple[float, MocapFrame]]:
-        """Return and remove the frames that arrive until world time `until_s`, each with its time of arrival."""
-        queue, until_s = self._mocap_queue, until_s + 1e-9
-        if not queue or queue[0][0] > until_s:
-            return []
-        frames = []
-        while queue and queue[0][0] <= until_s:
-            frames.append(queue.popleft())
-        return [] if self.fault("mocap_loss") else frames
-
-    def mocap_at(self, exposure_t_s: float) -> MocapFrame | None:
-        """Return and remove the frame that was exposed at this time, and remove older ones; None while motion capture is lost."""
-        queue, found = self._mocap_queue, None
-        while queue and queue[0][1].exposure_t_s <= exposure_t_s + 1e-9:
-            found = queue.popleft()[1]
-        return None if self.fault("mocap_loss") else found
 
     def battery(self) -> Battery:
         """Return the measurement of the power module. If the battery effect is off, the charge falls linearly with the time since

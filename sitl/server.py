@@ -16,8 +16,8 @@ from typing import Any
 from companion.model.launcher_messages import WorldEvent, WorldSlipped
 from companion.model.types import IDENTITY_QUAT
 from sitl.lockstep import CATCH_UP_S, LockstepLoop, TimeKeeper
+from sitl.mocap import MocapFrame
 from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
-from sitl.plant import MocapFrame
 from sitl.px4.hil_link import Px4Error
 from sitl.record import BarCourse
 from sitl.wires import MachineWires
@@ -262,7 +262,7 @@ class Sitl:
     def _send_frames(self) -> None:
         plant = self.machines[0].plant
         ahead_s = PHYSICS_DT_S - 1e-6 if self._keeper is None else 0.0
-        for leaves_s, frame in plant.mocap_until(plant.t_s + ahead_s):
+        for leaves_s, frame in plant.mocap.take_until(plant.t_s + ahead_s):
             if leaves_s <= plant.t_s:
                 self._publish(frame, plant.t_s)
             else:
@@ -286,7 +286,7 @@ class Sitl:
         if frame.bar is not None:
             poses += [BodyPose(number, *frame.bar) for number, _ in self._bar_body]
         for machine in self.machines:
-            seen = frame if machine is first else machine.plant.mocap_at(frame.exposure_t_s)
+            seen = frame if machine is first else machine.plant.mocap.take_exposed_at(frame.exposure_t_s)
             body = machine.vehicle.devices.mocap.rigid_body_id
             if seen is not None:
                 poses.append(BodyPose(body, seen.position_world_m, seen.attitude_wxyz, seen.valid))

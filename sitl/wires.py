@@ -122,7 +122,7 @@ class MachineWires:
             self.servos,
         )
         if config.faults:
-            self.plant.faults = self.faults
+            self.plant.inject(self.faults)
 
     def start_over(self, scene: Scene | None, number: int) -> None:
         """Put the machine back to its beginning, after its autopilot. What the companion has set in the devices stays."""
@@ -176,9 +176,9 @@ class MachineWires:
             self._hold_arm(self._arm_handling)
 
     def sense(self) -> None:
-        """Let the cameras and a real PX4 see the machine after a step of the scene."""
+        """Let motion capture and a real PX4 see the machine after a step of the scene."""
         plant = self.plant
-        plant.sense()
+        plant.mocap.sense()
         if self.autopilot.lockstep and plant.imu_due:
             self.autopilot.sense(plant.sample_imu())
 

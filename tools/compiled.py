@@ -35,7 +35,7 @@ WORK = ROOT / "build" / "mypyc"
 PACKAGES = ("companion", "sitl")
 SETTINGS = "companion/config/files"
 """A link to configs/, which the wheel contains as files."""
-# Without companion/io/dynamixel/registers.py: it extends a class of the servos' SDK, which crashes a compiled process.
+# Without companion/io/dynamixel/port.py: it extends a class of the servos' SDK, which crashes a compiled process.
 COMPILED = (
     "companion/core/*.py",
     "companion/control/**/*.py",
@@ -58,6 +58,7 @@ COMPILED = (
     "sitl/faults/injector.py",
     "sitl/fast/*.py",
     "sitl/force_torque.py",
+    "sitl/mocap.py",
     "sitl/plant.py",
     "sitl/servo/*.py",
     "sitl/world/**/*.py",

@@ -18,7 +18,8 @@ from companion.core.flight_core import FlightCore
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.types import Inputs, Outcome, Reference
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from sitl.plant import Plant
 from sitl.world.state import PHYSICS_DT_S
 from tests.support import CATCH

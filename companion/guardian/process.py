@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from companion.guardian import heartbeat
+from companion.guardian.flight_process import FlightProcess, HeartbeatReceiver
 from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.mocap import GuardianMocap
@@ -45,72 +46,6 @@ LINK_TIMEOUT_S = 30.0
 """Time after which the guardian gives up opening the link; the vehicle is then lost."""
 STATUS_PERIOD_S = 0.5
 ERROR_CHARS, ERRORS_REPORTED_MAX = 300, 20
-_MAX_DATAGRAMS = 512
-
-
-class FlightProcess:
-    """The flight process, referenced by pidfd: a reused process id cannot be mistaken for it."""
-
-    def __init__(self, pidfd: int) -> None:
-        self.pidfd = pidfd
-        self._end = select.poll()
-        self._end.register(pidfd, select.POLLIN)
-
-    def wait(self, timeout_s: float) -> bool:
-        """Wait up to `timeout_s`; return whether the process is dead. The kernel has then closed its sockets."""
-        return bool(self._end.poll(max(0, round(timeout_s * 1e3))))
-
-    def watch(self) -> bool:
-        """Wait for one period of the guardian, or for the end of the process; return whether it is dead."""
-        simulated_time.wait(self._end, PERIOD_S, data=False)
-        return self.wait(0.0)
-
-    def kill(self) -> None:
-        """Send SIGKILL, the only signal that ends a hung process in every case."""
-        with contextlib.suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
-
-
-class HeartbeatReceiver:
-    """The guardian's end of the socket to the flight process."""
-
-    def __init__(self, channel: socket.socket) -> None:
-        channel.setblocking(False)
-        self._channel = channel
-        self.last: Heartbeat | None = None
-        self.count = self.missed = 0
-        """Heartbeats received, and ticks for which the heartbeat is missing."""
-        self.recorder: socket.socket | None = None
-        """The recorder's channel, once the flight process has shared it."""
-
-    def receive(self) -> bool:
-        """Read all waiting datagrams; return whether a heartbeat was among them."""
-        heard = False
-        for _ in range(_MAX_DATAGRAMS):
-            try:
-                datagram, descriptors, _, _ = socket.recv_fds(self._channel, heartbeat.MAX_BYTES, 1)
-            except OSError:  # nothing more, or the flight process is gone, which its pidfd shows
-                break
-            if not datagram:
-                break
-            for descriptor in descriptors:
-                if datagram[:1] == heartbeat.RECORDER_CHANNEL and self.recorder is None:
-                    self.recorder = socket.socket(fileno=descriptor)
-                else:
-                    os.close(descriptor)
-            received = heartbeat.unpack(datagram)
-            if received is not None:
-                if self.last is not None:
-                    self.missed += max(0, received.tick - self.last.tick - 1)
-                self.count += 1
-                self.last, heard = received, True
-        return heard
-
-    def send_status(self, problem: str | None) -> None:
-        """Send READY, or PROBLEM with its reason; never waits."""
-        text = heartbeat.READY if problem is None else heartbeat.PROBLEM + problem.encode()[: heartbeat.MAX_BYTES - 1]
-        with contextlib.suppress(OSError):
-            self._channel.send(text, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 
 
 class Guardian:
@@ -137,8 +72,8 @@ class Guardian:
         self._reopening: Reopening[OpenWire] | None = None
         """Attempts to open a lost link again; None while it is open."""
         self._silent_s = 0.0
-        self._flight_hangs = False
         """Longest silence while the rotors might turn."""
+        self._flight_hangs = False
 
     def run(self) -> int:
         """Run until the flight has ended or the vehicle has landed; return the exit code."""
@@ -173,7 +108,7 @@ class Guardian:
         watch = StallWatch(self._settings.timeout_s)
         status_s = float("-inf")
         while True:
-            dead = self._flight.watch()
+            dead = self._flight.watch(PERIOD_S)
             now_s = monotonic()
             heard = self._heartbeats.receive()
             last = self._heartbeats.last
@@ -395,10 +330,7 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
     if arguments.time is not None:
         simulated_time.enter(arguments.time)
-    for number in (
-        signal.SIGINT,
-        signal.SIGHUP,
-    ):  # the flight lands on these signals; the guardian ends after the flight
+    for number in (signal.SIGINT, signal.SIGHUP):  # the flight lands on them; the guardian ends after it
         signal.signal(number, signal.SIG_IGN)
     settings = read_settings(arguments.config)
     with socket.socket(fileno=arguments.heartbeats) as heartbeats, socket.socket(fileno=arguments.channel) as channel:

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig
 from companion.io.devices import AvailableDevices, Devices
-from companion.io.dynamixel.registers import usb_latency_ms
+from companion.io.dynamixel.port import usb_latency_ms
 from companion.io.protocols import Autopilot, DeviceError
 from companion.model.estimator import EstimatorReport
 from companion.model.markers import MarkerFrame

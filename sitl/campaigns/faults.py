@@ -18,7 +18,7 @@ from companion.safety.touchdown import HEIGHT_MARGIN_M
 from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, with_world
 from sitl.campaigns.runner import Data
-from sitl.fast.loop import FastResult
+from sitl.fast.result import FastResult
 from sitl.faults.timing import FaultError, with_fault_times
 from sitl.world.state import Snapshot
 

@@ -20,7 +20,8 @@ from companion.sitl_config.distributions import draw
 from companion.sitl_config.loader import SitlConfig
 from companion.sitl_config.world import World
 from sitl.campaigns.runner import Data
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from companion.sitl_config.loader import SitlConfig
 from companion.sitl_config.team import SEED_APART, TeamConfig
 from sitl.campaigns.flights import laboratory_of, with_world
 from sitl.campaigns.runner import Data
-from sitl.fast.loop import FastResult
+from sitl.fast.result import FastResult
 from sitl.fast.team import FastTeam, TeamResult
 
 _WORSE = (Outcome.COMPLETED, Outcome.REFUSED, Outcome.ABORTED, Outcome.LOST, Outcome.CRASHED)

@@ -9,8 +9,7 @@ from msgspec.structs import replace
 from companion.config.arm import Joint
 from companion.config.vehicle import Vehicle
 from companion.flight.ticker import JOINT_LEAD_MAX_S
-from companion.io.dynamixel.registers import joint_scale
-from companion.io.dynamixel.scale import JointScale
+from companion.io.dynamixel.scale import JointScale, joint_scale
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.servos import WATCHDOG_ERROR
 from companion.model.types import ArmState, Joints

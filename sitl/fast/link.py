@@ -7,28 +7,33 @@ from collections.abc import Callable
 
 from msgspec.structs import replace
 
-from companion.model.types import AutopilotStatus, VehicleState
+from companion.model.types import AutopilotRequest, AutopilotStatus, VehicleState
 from sitl.autopilot.autopilot import Px4Stub
+from sitl.autopilot.commander import FORCE_MAGIC, Command
+from sitl.autopilot.modes import NavState
+from sitl.autopilot.types import Command7
 from sitl.faults.injector import Faults
 from sitl.world.scene import Scene
 
 MEMORY = 400
 """Longest possible delay of received states, in control ticks."""
+_OFFBOARD_MODE: Command7 = (1.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_NOTHING: Command7 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class FastLink:
     """The link between the flight core and the stub.
 
     Args:
-        faults: faults of the world.
+        faults: faults of the world; None if there are none, and messages then arrive at once.
         scene: simulated physics, which provides the time.
         px4: the stub; while it boots, the link is dead.
         tick_s: period of the control tick.
     """
 
-    def __init__(self, faults: Faults, scene: Scene, px4: Px4Stub, tick_s: float) -> None:
+    def __init__(self, faults: Faults | None, scene: Scene, px4: Px4Stub, tick_s: float) -> None:
         self._faults, self._scene, self._px4, self._tick_s = faults, scene, px4, tick_s
-        self._in_flight: deque[tuple[float, Callable[[], None]]] = deque()
+        self._in_flight: deque[tuple[float, Callable[[], object]]] = deque()
         self._received: deque[tuple[VehicleState | None, AutopilotStatus | None]] = deque(maxlen=MEMORY)
         """States that PX4 sent in the last ticks, newest first."""
         self._behind = 0
@@ -38,17 +43,35 @@ class FastLink:
     @property
     def alive(self) -> bool:
         """Whether messages arrive."""
-        return "link_loss" not in self._faults.active and self._scene.t_s >= self._px4.booted_at_s
+        faults = self._faults
+        return faults is None or ("link_loss" not in faults.active and self._scene.t_s >= self._px4.booted_at_s)
 
-    def send(self, deliver: Callable[[], None]) -> None:
+    def send(self, deliver: Callable[[], object]) -> None:
         """Send a message to PX4; `deliver` is called when the message arrives."""
         if not self.alive:
             return
-        delay_s = self._faults.size("link_delay")
+        delay_s = 0.0 if self._faults is None else self._faults.size("link_delay")
         if delay_s or self._in_flight:
             self._in_flight.append((self._scene.t_s + delay_s, deliver))
         else:
             deliver()
+
+    def request(self, request: AutopilotRequest) -> None:
+        """Send the command of a request to PX4."""
+        self.send(lambda: self._execute(request))
+
+    def _execute(self, request: AutopilotRequest) -> None:
+        t_s, px4 = self._scene.t_s, self._px4
+        if request is AutopilotRequest.OFFBOARD:
+            px4.on_command(t_s, Command.DO_SET_MODE, _OFFBOARD_MODE)
+        elif request is AutopilotRequest.ARM:
+            px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, (1.0, *_NOTHING[1:]))
+        elif request is AutopilotRequest.LAND and px4.nav_state is not NavState.LAND:
+            px4.on_command(t_s, Command.NAV_LAND, _NOTHING)
+        elif request is AutopilotRequest.DISARM:
+            px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, _NOTHING)
+        elif request is AutopilotRequest.FORCE_DISARM:
+            px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, (0.0, float(FORCE_MAGIC), *_NOTHING[2:]))
 
     def deliver_due(self) -> None:
         """Deliver delayed messages that are due; call this method in every tick."""
@@ -64,6 +87,8 @@ class FastLink:
         """Return what the core receives in this tick: a delayed state if the link is slow, the last received state if the link is
         lost.
         """
+        if self._faults is None:
+            return state, status
         received = self._received
         if not self.alive and received:
             return received[0]

@@ -5,11 +5,8 @@ It keeps the sensor rates, quantisation, noise and delays of the real protocols 
 
 from __future__ import annotations
 
-import contextlib
-import gc
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Final
 
@@ -18,114 +15,45 @@ from msgspec.structs import replace
 from companion.control.types import MakeLaw
 from companion.core.flight_core import FlightCore
 from companion.flight.ticker import SIMULATED_START_S
-from companion.io.mocap.client import KEEP_ALIVE_PERIOD_S
-from companion.io.mocap.markers import marker_frame
-from companion.io.mocap.server_clock import ServerClock
 from companion.model.constants import TICK_PERIOD_S
-from companion.model.frames import (
-    attitude_ned_frd_from_enu_flu,
-    ned_from_enu,
-)
-from companion.model.markers import MarkerFrame
+from companion.model.frames import attitude_ned_frd_from_enu_flu, ned_from_enu
 from companion.model.outputs import Outputs
-from companion.model.team import BarPose, Grip, PartnerState, TeamState
+from companion.model.team import Grip, PartnerState, TeamState
 from companion.model.types import (
     AutopilotRequest,
-    Event,
-    FlightMode,
     ForceSample,
     Inputs,
-    LandedState,
     MocapPose,
     OperatorCommand,
-    Quat,
-    Vec3,
     VehicleState,
 )
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.loader import SitlConfig
 from sitl.autopilot.backend import LINK_DELAY_S, set_hover_thrust, stub_of
-from sitl.autopilot.commander import FORCE_MAGIC, Command
-from sitl.autopilot.modes import NavState
-from sitl.autopilot.types import AttitudeTarget, Command7
+from sitl.autopilot.types import AttitudeTarget
 from sitl.fast.bus import FastBus, scales_of
 from sitl.fast.clamp import FastClamp
 from sitl.fast.guardian import TAKE_OVER_S, FastGuardian, Landing
 from sitl.fast.link import FastLink
+from sitl.fast.mocap import FastMocap
+from sitl.fast.result import FastResult, garbage_collection_paused
 from sitl.fast.telemetry import FastTelemetry
 from sitl.faults.injector import Faults
 from sitl.faults.timing import with_fault_times
 from sitl.force_torque import TIME_EPSILON_S, overloaded, quantised
-from sitl.plant import MocapFrame, Plant
+from sitl.plant import Plant
 from sitl.servo.from_config import plugged_in, servos_of
 from sitl.world.scene import Scene
 from sitl.world.start import start_of
-from sitl.world.state import Layout, Snapshot, Truth
 from sitl.world.throws import with_throws
 
 START_S: Final = SIMULATED_START_S
 """World time at the first tick, as over the wires."""
 _NO_COMMAND: Final = OperatorCommand.NONE
-_ON_GROUND: Final = LandedState.ON_GROUND
-_IN_AIR: Final = LandedState.IN_AIR
 _NO_REQUEST: Final = AutopilotRequest.NONE
 SETTLE_S: Final = 30.0
 """Longest time for which the world continues after a flight that ends while armed."""
 FLIGHT_PROCESS_FAULTS: Final[frozenset[FaultKind]] = frozenset({"stall_loop", "hold_gil", "stop_flight", "kill_flight"})
-_MODES: Final = {
-    NavState.OFFBOARD: FlightMode.OFFBOARD,
-    NavState.LAND: FlightMode.LAND,
-    NavState.LOITER: FlightMode.HOLD,
-}
-_OFFBOARD_MODE: Command7 = (1.0, 6.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-_NOTHING: Command7 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-@dataclass
-class FastResult:
-    """Record of one flight."""
-
-    inputs: list[Inputs] = field(default_factory=list)
-    outputs: list[Outputs] = field(default_factory=list)
-    crashed: bool = False
-    caught: bool = False
-    miss_m: float | None = None
-    """Distance of the first throw from the net's centre (`Payload.miss_m`); None if nothing was thrown."""
-    snapshots: list[Snapshot] = field(default_factory=list)
-    """States of the world, one after each tick."""
-    layout: Layout | None = None
-    after: list[Snapshot] = field(default_factory=list)
-    """States of the world every 5 ms after the last tick, while the guardian or PX4 lands the vehicle."""
-    guardian_events: list[Event] = field(default_factory=list)
-    """Events of the guardian; empty if it did not act."""
-    guardian_landed: bool | None = None
-    """Whether the guardian landed the vehicle; None if it did not act or has not finished."""
-    armed: bool = False
-    """Whether the vehicle is still armed at the end."""
-    _truth: list[Truth] | None = field(default=None, repr=False)  # mypyc sets no default with init=False
-
-    @property
-    def truth(self) -> list[Truth]:
-        """True state after each tick; computed on first access."""
-        if self._truth is None:
-            layout = self.layout
-            self._truth = [] if layout is None else [layout.truth(snapshot) for snapshot in self.snapshots]
-        return self._truth
-
-
-@contextlib.contextmanager
-def garbage_collection_paused() -> Iterator[None]:
-    """Pause garbage collection: a flight creates many records and no reference cycles, so collecting only costs time."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            # Moves the records to the oldest generation, so that the next collection does not traverse all of them.
-            gc.freeze()
-            gc.unfreeze()
-            gc.enable()
 
 
 class FastFlight:
@@ -159,10 +87,11 @@ class FastFlight:
         jaws = None if self._clamp is None else self._clamp.drive
         self.plant = Plant(vehicle, world, self.px4, drives, pose, jaws=jaws, scene=scene, number=number)
         self.faults = Faults(world, self.plant.scene, self.plant.machine, self.px4, drives, vehicle.tether)
-        if world.faults:
-            self.plant.faults = self.faults
-        self._guardian = FastGuardian(vehicle, self.px4) if world.faults else None
-        self._link = FastLink(self.faults, self.plant.scene, self.px4, TICK_PERIOD_S)
+        faults = self.faults if world.faults else None
+        if faults is not None:
+            self.plant.inject(faults)
+        self._guardian = None if faults is None else FastGuardian(vehicle, self.px4)
+        self._link = FastLink(faults, self.plant.scene, self.px4, TICK_PERIOD_S)
         hover = set_hover_thrust(self.px4, world, self.plant.machine)
         if vehicle.airframe.hover_thrust is None:
             airframe = vehicle.airframe.model_copy(update={"hover_thrust": hover})
@@ -172,17 +101,10 @@ class FastFlight:
         self.core = FlightCore(config.flight, make_law)
         scales = scales_of(vehicle, plugged_in(servos, world))
         watchdog_s = vehicle.arm_device.watchdog_ms * 1e-3 if drives else 0.0
-        self._bus = FastBus(drives, scales, watchdog_s, self.faults if world.faults else None)
+        self._bus = FastBus(drives, scales, watchdog_s, faults)
         self._external = vehicle.devices.mocap.external
         """Whether another program feeds PX4 with poses: the companion receives none."""
-        self._mocap: MocapPose | None = None
-        self._sees_ball = vehicle.devices.mocap.ball is not None
-        self._markers: MarkerFrame | None = None
-        self._sees_bar = vehicle.devices.mocap.bar_id is not None
-        self._bar: BarPose | None = None
-        self._tracked_m: Vec3 = (0.0, 0.0, 0.0)
-        """Newest position at which the vehicle's body was tracked."""
-        self._server_clock, self._echo_due_s = ServerClock(), 0.0
+        self._mocap = FastMocap(vehicle.devices.mocap, faults)
         force = vehicle.devices.force
         self._force_period_s = None if force is None else 1.0 / force.rate_hz
         """Period of the force sensor's samples; None if the vehicle has none."""
@@ -204,8 +126,8 @@ class FastFlight:
         """Time at which the guardian that has decided to land takes over, and its landing; infinite and None without one."""
         self._lands_s = 0.0
         """Time of the newest record of a landing without the flight process."""
-        self._settles_until_s: float | None = None
-        """Time until which PX4 may finish a landing; None before the flight has ended."""
+        self._settles_until_s = math.inf
+        """Time until which PX4 may finish a landing; infinite before the flight has ended."""
         self.over = False
         """Whether the flight has ended and `result` is complete."""
 
@@ -256,13 +178,13 @@ class FastFlight:
         """Do everything that is due after a step of the scene; return the outputs of a control tick, if one was due."""
         plant = self.plant
         scene = plant.scene
-        plant.sense()
+        plant.mocap.sense()
         if self.over:
             return None
         if self._landing is not None or self._opens_s < math.inf:
             self._guardian_lands()
             return None
-        if self._settles_until_s is not None:
+        if self._settles_until_s < math.inf:
             self._settle()
             return None
         self._receive()
@@ -276,7 +198,7 @@ class FastFlight:
             return None
         self._period += 1
         outputs = self._tick()
-        if not self.over and self._settles_until_s is None and scene.t_s >= self._limit_s:
+        if not self.over and self._settles_until_s == math.inf and scene.t_s >= self._limit_s:
             self._end()
         return outputs
 
@@ -316,8 +238,8 @@ class FastFlight:
         plant = self.plant
         if plant.faults is not None:
             self._bus.step(plant.scene.t_s)
-        for frame in plant.take_mocap()[-1:]:  # of frames that wait, the driver delivers the newest
-            self._deliver(frame)
+        for frame in plant.mocap.take()[-1:]:  # of frames that wait, the driver delivers the newest
+            self._forward(self._mocap.receive(frame, plant.scene.t_s))
         if self._force_period_s is not None and plant.scene.t_s >= self._force_due_s - TIME_EPSILON_S:
             self._force_due_s += self._force_period_s
             self._sample_force()
@@ -350,7 +272,6 @@ class FastFlight:
         self._force = ForceSample(stamp_s=math.nan, force_sensor_n=force, torque_sensor_nm=torque, overload=overload)
 
     def _settling(self) -> bool:
-        assert self._settles_until_s is not None
         return self.px4.armed and not self.plant.machine.crashed and self.plant.scene.t_s < self._settles_until_s
 
     def _settle(self) -> None:
@@ -396,71 +317,34 @@ class FastFlight:
 
     def _poses_for_guardian(self) -> list[MocapPose]:
         """Return the poses of this step; none if another program sends them to PX4 itself, which it does here."""
-        frames = self.plant.take_mocap()
+        plant = self.plant
+        poses = [self._mocap.pose(frame, plant.scene.t_s) for frame in plant.mocap.take()]
         if not self._external:
-            return [self._pose(frame) for frame in frames]
-        for frame in frames:
-            self._deliver(frame)
+            return poses
+        for pose in poses:
+            self._forward(pose)
         return []
 
-    def _deliver(self, frame: MocapFrame) -> None:
-        pose = self._pose(frame)
-        if not self._external:
-            self._mocap = pose
-        if self._sees_bar and frame.bar is not None:
-            at, turned = frame.bar
-            self._bar = BarPose(stamp_s=pose.stamp_s, position_world_m=at, attitude_wxyz=turned, tracking_valid=True)
-        if self._sees_ball:
-            self._tracked_m = pose.position_world_m if pose.tracking_valid else self._tracked_m
-            self._markers = marker_frame(
-                pose.stamp_s, pose.latency_s, pose.frame_number, frame.markers, self._tracked_m
-            )
-        if pose.tracking_valid if self._external else self.core.forwards(pose, self._vehicle):
-            position, attitude = ned_from_enu(pose.position_world_m), attitude_ned_frd_from_enu_flu(pose.attitude_wxyz)
-            if self.plant.faults is None or self._external:
-                self.px4.on_vision(pose.stamp_s, position, attitude)
-            elif self.faults.active.keys().isdisjoint(FLIGHT_PROCESS_FAULTS):
-                self._link.send(lambda: self._see(position, attitude))
-
-    def _see(self, position_ned_m: Vec3, attitude_ned_frd: Quat) -> None:
-        self.px4.on_vision(self.plant.scene.t_s, position_ned_m, attitude_ned_frd)
-
-    def _pose(self, frame: MocapFrame) -> MocapPose:
-        t_s = self.plant.scene.t_s
-        number, exposure_s, position, attitude, valid, network_s, _, _ = frame
-        latency_s, exposure_server_s = t_s - exposure_s, exposure_s
-        if self.plant.faults is not None:
-            clock = self.faults.server_clock_s
-            if t_s >= self._echo_due_s:
-                self._echo_due_s = t_s + KEEP_ALIVE_PERIOD_S
-                self._server_clock.echo(t_s, clock(t_s))
-            exposure_server_s = clock(exposure_s)
-            latency_s = clock(t_s - network_s) - exposure_server_s
-            latency_s = self._server_clock.age_s(exposure_server_s, latency_s, t_s)
-        return MocapPose(
-            stamp_s=t_s,
-            latency_s=latency_s,
-            frame_number=number,
-            position_world_m=position,
-            attitude_wxyz=attitude,
-            tracking_valid=valid,
-            marker_error_m=0.0002,
-            exposure_server_s=exposure_server_s,
-        )
+    def _forward(self, pose: MocapPose) -> None:
+        """Send a pose to PX4, as the flight process does or, on a link of its own, the other program."""
+        if not (pose.tracking_valid if self._external else self.core.forwards(pose, self._vehicle)):
+            return
+        position, attitude = ned_from_enu(pose.position_world_m), attitude_ned_frd_from_enu_flu(pose.attitude_wxyz)
+        if self._external:
+            self.px4.on_vision(pose.stamp_s, position, attitude)
+        elif self.faults.active.keys().isdisjoint(FLIGHT_PROCESS_FAULTS):
+            self._link.send(lambda: self.px4.on_vision(self.plant.scene.t_s, position, attitude))
 
     def _inputs(self, tick: int) -> Inputs:
         plant, t_s = self.plant, self.plant.scene.t_s
-        dropped, guardian_ready = 0, None
-        if plant.faults is None:
-            vehicle, status = self._telemetry.vehicle(t_s), self._telemetry.status(t_s)
-        else:
-            self._link.deliver_due()
-            vehicle, status = self._link.receive(self._telemetry.vehicle(t_s), self._telemetry.status(t_s))
-            active = self.faults.active
+        self._link.deliver_due()
+        vehicle, status = self._link.receive(self._telemetry.vehicle(t_s), self._telemetry.status(t_s))
+        guardian_ready = None
+        if plant.faults is not None:
+            active = plant.faults.active
             guardian_ready = "kill_guardian" not in active
             if "kill_recorder" in active or "disk_full" in active:
                 self._dropped += 1
-            dropped = self._dropped
         self._vehicle = vehicle
         if self._force is not None and math.isnan(self._force.stamp_s):
             self._force = replace(self._force, stamp_s=t_s)
@@ -470,16 +354,16 @@ class FastFlight:
             t_s=t_s,
             vehicle=vehicle,
             status=status,
-            mocap=self._mocap,
+            mocap=self._mocap.newest,
             arm=self._bus.read(t_s),
             force=self._force,
             command=self._commands.pop(0)[1] if due else _NO_COMMAND,
-            recorder_dropped=dropped,
+            recorder_dropped=self._dropped,
             guardian_ready=guardian_ready,
             estimator=self._telemetry.estimator(t_s) if self._external else None,
-            markers=self._markers,
+            markers=self._mocap.markers,
             clamp=None if self._clamp is None else self._clamp.read(t_s),
-            bar=self._bar,
+            bar=self._mocap.bar,
             partner=self.partner,
         )
 
@@ -489,38 +373,18 @@ class FastFlight:
         """
         if outputs is not None:
             return outputs.team
-        guardian, pose = self._guardian, self._mocap
+        guardian, pose = self._guardian, self._mocap.newest
         if self._landing is None or guardian is None or not guardian.alive or pose is None:
             return None
         return TeamState(grip=Grip.FREE, holds=True, lands=True, px4_lands=True, position_world_m=pose.position_world_m)
 
     def _carry_out(self, outputs: Outputs) -> None:
-        setpoint, request = outputs.attitude, outputs.request
-        with_faults = self.plant.faults is not None
+        setpoint = outputs.attitude
         if setpoint is not None:
             target = AttitudeTarget(attitude_ned_frd_from_enu_flu(setpoint.attitude_wxyz), setpoint.thrust)
-            if with_faults:
-                self._link.send(lambda: self.px4.on_setpoint(self.plant.scene.t_s, target))
-            else:
-                self.px4.on_setpoint(self.plant.scene.t_s, target)
+            self._link.send(lambda: self.px4.on_setpoint(self.plant.scene.t_s, target))
         self._bus.write(self.plant.scene.t_s, outputs.arm_torque_nm)
         if self._clamp is not None:
             self._clamp.write(outputs.clamp)
-        if request is not _NO_REQUEST:
-            if with_faults:
-                self._link.send(lambda: self._request(request))
-            else:
-                self._request(request)
-
-    def _request(self, request: AutopilotRequest) -> None:
-        t_s = self.plant.t_s
-        if request is AutopilotRequest.OFFBOARD:
-            self.px4.on_command(t_s, Command.DO_SET_MODE, _OFFBOARD_MODE)
-        elif request is AutopilotRequest.ARM:
-            self.px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, (1.0, *_NOTHING[1:]))
-        elif request is AutopilotRequest.LAND and self.px4.nav_state is not NavState.LAND:
-            self.px4.on_command(t_s, Command.NAV_LAND, _NOTHING)
-        elif request is AutopilotRequest.DISARM:
-            self.px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, _NOTHING)
-        elif request is AutopilotRequest.FORCE_DISARM:
-            self.px4.on_command(t_s, Command.COMPONENT_ARM_DISARM, (0.0, float(FORCE_MAGIC), *_NOTHING[2:]))
+        if outputs.request is not _NO_REQUEST:
+            self._link.request(outputs.request)

@@ -9,7 +9,8 @@ from typing import Final
 from companion.model.team import PartnerState, TeamState
 from companion.model.types import OperatorCommand
 from companion.sitl_config.team import TeamConfig
-from sitl.fast.loop import FastFlight, FastResult, garbage_collection_paused
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult, garbage_collection_paused
 from sitl.world.pair import pair_scene
 from sitl.world.pair_truth import PairTruth
 

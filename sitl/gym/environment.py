@@ -22,7 +22,8 @@ from companion.model.outputs import Outputs
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import Flown, with_world
 from sitl.campaigns.tune import graded
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from sitl.gym.picture import picture
 
 Vector = npt.NDArray[np.float32]

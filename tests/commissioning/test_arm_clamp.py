@@ -12,7 +12,7 @@ from companion.model.exit_codes import EXIT_OK
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from tests.commissioning.arm_rig import Rig, bad_ids, keys, row_of, served
-from tests.io.test_arm import register
+from tests.io.arm_rig import register
 from tests.support import ROOT, sandbox_in
 
 FILE = ROOT / "configs/vehicles/tarot650_2r_clamp.yaml"

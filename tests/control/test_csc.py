@@ -18,7 +18,8 @@ from companion.mission.reference import at_rest
 from companion.model.frames import rotation_matrix
 from companion.model.types import IDENTITY_QUAT, PhaseKind, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.control.states import POSE, ZERO, at
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
 

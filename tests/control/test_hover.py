@@ -14,7 +14,8 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Quat, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.control.states import at
 from tests.support import CATCH, SHORT_CATCH
 

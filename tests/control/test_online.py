@@ -21,7 +21,8 @@ from companion.model.outputs import Outputs
 from companion.model.types import Chi, Inputs, OperatorCommand, PhaseKind, SafetyAction, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import log_of
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 
 CONFIG = load_flight("configs/missions/circuit.yaml", preset="recommended")
 assert isinstance(CONFIG.controller, AdaptiveConfig)

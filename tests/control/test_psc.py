@@ -18,7 +18,8 @@ from companion.mission.reference import at_rest
 from companion.model.types import PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import log_of
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.analysis.recorded import record
 from tests.control.states import POSE, at
 from tests.flights.ends import after

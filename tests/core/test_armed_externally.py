@@ -26,7 +26,8 @@ from companion.model.types import (
 )
 from companion.safety.rotor_stop import DISARM_STILL_S
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.safety.healthy import healthy, put
 
 replace = msgspec.structs.replace

@@ -26,7 +26,8 @@ from companion.model.outputs import Outputs
 from companion.model.types import Inputs, OperatorCommand, Outcome
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.flights.ends import after, contact_over
 
 PRESS = "configs/missions/press.yaml"

@@ -21,7 +21,9 @@ from companion.model.types import (
 )
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.autopilot.autopilot import Px4Stub
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
+from sitl.mocap import MocapFrame
 from tests.safety.healthy import healthy, put
 from tests.support import HOVER, SHORT_CATCH
 
@@ -39,14 +41,16 @@ class Spoiled(FastFlight):
 
     def __init__(self, config: SitlConfig, change: Change, lift_m: float) -> None:
         super().__init__(config)
-        self._change, self._lift_m = change, lift_m
+        self._change = change
+        plant, take = self.plant, self.plant.mocap.take
 
-    def _pose(self, frame: object) -> MocapPose:
-        """The error comes in slowly, as a shifting volume would bring it; PX4 is reported the same."""
-        pose = super()._pose(frame)  # type: ignore[arg-type]
-        share = min(1.0, max(0.0, (pose.stamp_s - 4.0) / 8.0))
-        x, y, z = pose.position_world_m
-        return replace(pose, position_world_m=(x, y, z + self._lift_m * share))
+        def lifted() -> list[MocapFrame]:
+            """The error comes in slowly, as a shifting volume would bring it; PX4 is reported the same."""
+            by_m = lift_m * min(1.0, max(0.0, (plant.t_s - 4.0) / 8.0))
+            frames = [(frame, *frame.position_world_m) for frame in take()]
+            return [frame._replace(position_world_m=(x, y, z + by_m)) for frame, x, y, z in frames]
+
+        plant.mocap.take = lifted  # type: ignore[method-assign]
 
     def _inputs(self, tick: int) -> Inputs:
         return self._change(super()._inputs(tick))

@@ -26,7 +26,8 @@ from companion.phases.contact.force import touches
 from companion.phases.contact.sliding import STEER_MAX_RAD, UNSEEN_MAX_N
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.control.states import ZERO, at
 from tests.flights.ends import after, contact_over
 

@@ -10,7 +10,8 @@ from companion.control.hover_thrust import AIRBORNE_M
 from companion.model.frames import tilt_rad
 from companion.model.types import OperatorCommand, Outcome, PhaseKind, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.support import SHORT_CATCH
 
 

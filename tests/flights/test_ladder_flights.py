@@ -24,7 +24,8 @@ from companion.model.types import (
     VehicleState,
 )
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.flights.ends import after
 from tests.support import HOVER, LOW_HOVER, SHORT_CATCH, tether_of
 

@@ -16,7 +16,8 @@ from companion.core.flight_core import FlightCore
 from companion.model.types import OperatorCommand, Outcome, PhaseKind
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import log_of
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.machines import overrides_with_joints
 from tests.support import CATCH, HOVER, LOW_HOVER, SHORT_CATCH
 

@@ -17,6 +17,7 @@ from companion.config.devices import ArmDevice
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.dynamixel.bus import ArmBus
+from companion.io.dynamixel.port import NOISE_BYTES, ServoPort
 from sitl.servo.bus import ServoBus, ServoLine
 from sitl.servo.model import ServoModel
 from sitl.servo.protocol import ALERT, Instruction, fast_status, packet, status
@@ -85,7 +86,7 @@ class MemorySerial:
         """Do nothing."""
 
 
-class MemoryPort(dxl.ServoPort):
+class MemoryPort(ServoPort):
     """The companion's port on a `MemorySerial`."""
 
     def __init__(self, line: MemorySerial) -> None:
@@ -102,7 +103,7 @@ class MemoryPort(dxl.ServoPort):
         return written
 
     def _receive(self) -> bytes:
-        data: bytes = self.ser.read(dxl.NOISE_BYTES)
+        data: bytes = self.ser.read(NOISE_BYTES)
         return data
 
     def getCurrentTime(self) -> float:

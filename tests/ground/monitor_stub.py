@@ -38,7 +38,8 @@ from companion.model.codec import to_jsonable
 from companion.model.outputs import Sent
 from companion.model.types import OperatorCommand
 from companion.sitl_config.loader import load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.ground.vehicle import ack_of, state_of
 from tests.support import CATCH, DEADLINE_S
 

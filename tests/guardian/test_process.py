@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.guardian.flight_process import HeartbeatReceiver
 from companion.guardian.heartbeat import MAX_BYTES, PROBLEM, READY
-from companion.guardian.process import HeartbeatReceiver, main
+from companion.guardian.process import main
 from companion.launcher.guardian_process import outcome_of
 from companion.model.frames import attitude_enu_flu_from_ned_frd, ned_from_enu, wrap_rad
 from companion.model.launcher_messages import FlightEvent, GuardianEnded

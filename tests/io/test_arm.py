@@ -8,85 +8,39 @@ import math
 import os
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 import serial
 
-from companion.config.arm import Arm as ArmConfig
 from companion.config.arm import Joint
-from companion.config.devices import ArmDevice
 from companion.io.dynamixel.arm import DynamixelArm
-from companion.io.dynamixel.scale import RAD_PER_COUNT
 from companion.io.protocols import Arm as ArmEdge
 from companion.model.observations import ServoReport
 from companion.model.servos import WATCHDOG_ERROR, ServoName
-from companion.model.types import ArmState
 from companion.runtime.clock import flight_clock
 from sitl.servo.bus import ServoBus
 from sitl.servo.kinds import KINDS
 from sitl.servo.model import ServoModel
+from tests.io.arm_rig import (
+    JOINTS,
+    KT,
+    NM_PER_COUNT,
+    START_DEG,
+    arm_config,
+    device_on,
+    flying_arm,
+    new_servos,
+    register,
+    shaft_rad,
+    state_when,
+    until,
+)
 from tests.support import DEADLINE_S
 from tests.wires import plugged
-
-KT = 1.3
-NM_PER_COUNT = KT * 2.69e-3
-JOINTS = (
-    Joint(servo_id=11, sign=-1, zero_count=3072, angle_deg=(-20, 180), torque_max_nm=2.5),
-    Joint(servo_id=12, sign=1, zero_count=1024, angle_deg=(-150, 150), torque_max_nm=1.5),
-)
-START_DEG = (165.0, 140.0)
-
-
-def arm_config(*joints: Joint, torque_per_amp_nm_a: float | None = KT) -> ArmConfig:
-    joints = joints or JOINTS
-    return ArmConfig(
-        shoulder_body_m=(0.0, 0.0, -0.05),
-        link_lengths_m=(0.2,) * len(joints),
-        link_masses_kg=(0.05,) * len(joints),
-        link_com_m=(0.1,) * len(joints),
-        torque_per_amp_nm_a=torque_per_amp_nm_a,
-        joints=joints,
-    )
-
-
-def shaft_rad(joint: Joint, angle_rad: float) -> float:
-    return joint.zero_count * RAD_PER_COUNT + joint.sign * angle_rad
-
-
-def new_servos(baud: int = 3_000_000, start_deg: tuple[float, float] = START_DEG) -> list[ServoModel]:
-    return [
-        ServoModel(joint.servo_id, baud_bps=baud, shaft_angle_rad=shaft_rad(joint, math.radians(angle)))
-        for joint, angle in zip(JOINTS, start_deg, strict=True)
-    ]
-
-
-def register(servo: ServoModel, address: int, size: int = 1) -> int:
-    return int.from_bytes(servo.read(address, size), "little", signed=size > 1)
-
-
-def device_on(path: str, **changes: Any) -> ArmDevice:
-    return ArmDevice(port=path, **changes)
-
-
-@dataclass
-class Setup:
-    servos: list[ServoModel]
-    bus: ServoBus
-    arm: DynamixelArm
-    clock: Callable[[], float]
-
-
-@asynccontextmanager
-async def flying_arm(**device: Any) -> AsyncIterator[Setup]:
-    servos = new_servos()
-    clock = flight_clock()
-    async with ServoBus(servos) as bus, DynamixelArm(device_on(bus.path, **device), arm_config(), clock) as arm:
-        yield Setup(servos, bus, arm, clock)
 
 
 @pytest.fixture(autouse=True)
@@ -97,19 +51,6 @@ def _nothing_left() -> Iterator[None]:
 
 def assert_nothing_left() -> None:
     assert [thread.name for thread in threading.enumerate() if thread.name == "arm-bus"] == []
-
-
-async def state_when(arm: ArmEdge, condition: Callable[[ArmState], bool]) -> ArmState:
-    while True:
-        state = await arm.read(1.0)
-        assert state is not None
-        if condition(state):
-            return state
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    while not condition():  # noqa: ASYNC110 - registers have no event to wait for
-        await asyncio.sleep(0.001)
 
 
 async def test_an_arm_opens_although_every_third_packet_is_damaged() -> None:

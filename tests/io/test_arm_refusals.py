@@ -17,7 +17,7 @@ from companion.runtime.clock import flight_clock
 from sitl.servo import registers as reg
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
-from tests.io.test_arm import arm_config, device_on, flying_arm, new_servos, register, state_when
+from tests.io.arm_rig import arm_config, device_on, flying_arm, new_servos, register, state_when
 
 
 async def opening(path: str, config: ArmConfig | None = None) -> str:

@@ -18,7 +18,7 @@ from companion.runtime.clock import flight_clock
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from sitl.world.jaws import Jaws as World
-from tests.io.test_arm import arm_config, device_on, new_servos, register, until
+from tests.io.arm_rig import arm_config, device_on, new_servos, register, until
 from tests.support import DEADLINE_S
 
 CONFIG = Jaws(servo_id=13, open_deg=90.0, closed_deg=180.0)

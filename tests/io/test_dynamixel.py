@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from companion.config.arm import Joint
 from companion.io.dynamixel import registers as dxl
-from companion.io.dynamixel.registers import joint_scale, turn_offset_counts, usb_latency_ms
+from companion.io.dynamixel.port import usb_latency_ms
+from companion.io.dynamixel.scale import joint_scale, turn_offset_counts
 from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
 
 KT = 1.3

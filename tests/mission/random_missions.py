@@ -24,7 +24,8 @@ from companion.model.types import PhaseKind
 from companion.safety.governor import BODY_TOP_M
 from companion.safety.tether import slack_m
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.support import ROOT, tether_of, tool_of
 
 FLIGHT_LIMIT_S = 120.0

@@ -52,7 +52,7 @@ class Standing:
             tick += 1
             while self.plant.t_s < tick * TICK_S - 1e-9:
                 self.plant.step(False)
-                for frame in self.plant.take_mocap():
+                for frame in self.plant.mocap.take():
                     t_s, p, q = self.plant.t_s, frame.position_world_m, frame.attitude_wxyz
                     self._pose = MocapPose(
                         stamp_s=t_s,

@@ -13,7 +13,7 @@ from companion.config.loader import load_flight
 from companion.model.outputs import Outputs, Sent, TetherState
 from companion.model.types import Inputs
 from companion.recorder.client import RecorderProcess
-from sitl.fast.loop import FastResult
+from sitl.fast.result import FastResult
 from tests.analysis.synthetic_flight import synthetic_flight
 from tests.support import DEADLINE_S
 

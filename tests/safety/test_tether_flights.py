@@ -9,7 +9,8 @@ import pytest
 
 from companion.model.outputs import Outputs
 from companion.model.types import Outcome, PhaseKind, SafetyAction, Vec3
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from sitl.world.state import Truth
 from tests.safety.test_tether import ANCHOR, config, vehicle
 from tests.support import tether_of

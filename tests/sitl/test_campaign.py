@@ -31,7 +31,8 @@ from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns import compare, faults, flights, robustness, runner
 from sitl.campaigns.flights import Flown
 from sitl.campaigns.runner import Fly
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.machines import overrides_with_joints
 from tests.support import DEADLINE_S, SHORT_CATCH, Sandbox, position_error_m, run_here, sandbox_in, wait_until
 

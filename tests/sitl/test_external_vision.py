@@ -21,8 +21,9 @@ from companion.sitl_config.loader import load_sitl
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.campaigns.flights import log_of
 from sitl.external_vision import ExternalVision
-from sitl.fast.loop import FastFlight, FastResult
-from sitl.plant import MocapFrame
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
+from sitl.mocap import MocapFrame
 from tests.sitl.px4_rig import Rig
 from tests.support import DEADLINE_S, HOVER, HOVERS_S, LOW_HOVER, SHORT_CATCH
 

@@ -23,7 +23,8 @@ from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.faults import fly, prepare
 from sitl.campaigns.robustness import draw, throws
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from sitl.faults.timing import FaultError, with_fault_times
 from tests.support import CATCH, HOVER, ROOT, SHORT_CATCH
 

@@ -9,7 +9,8 @@ import pytest
 from companion.config.safety import Safety
 from companion.model.types import Outcome
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.support import SHORT_CATCH
 
 LIMIT_M = Safety().mocap_inertial_m

@@ -6,7 +6,7 @@ import pytest
 
 from companion.model.frames import quat_conjugate, quat_multiply
 from companion.model.types import Quat, Vec3
-from sitl.plant import MocapFrame
+from sitl.mocap import MocapFrame
 from tests.preflight.hand_rig import world
 from tests.sitl.plants import plant_of
 
@@ -21,7 +21,7 @@ def flight(between_steps: bool, rate_hz: float = 200.0) -> tuple[list[MocapFrame
     while plant.t_s < 0.4:
         plant.step(True)
         truth[round(plant.t_s, 6)] = (plant.truth.position_world_m, plant.truth.attitude_wxyz)
-        frames += plant.take_mocap()
+        frames += plant.mocap.take()
     return frames, truth
 
 
@@ -60,7 +60,7 @@ def test_frames_are_handed_out_with_the_time_at_which_they_leave() -> None:
     leave_s = []
     while plant.t_s < 0.1:
         plant.step(False)
-        for at_s, frame in plant.mocap_until(plant.t_s + 0.0019):
+        for at_s, frame in plant.mocap.take_until(plant.t_s + 0.0019):
             assert at_s == pytest.approx(frame.exposure_t_s + 0.005)
             assert plant.t_s - 0.002 < at_s < plant.t_s + 0.002
             leave_s.append(at_s)

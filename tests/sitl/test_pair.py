@@ -11,7 +11,7 @@ from companion.model.team import Grip
 from companion.model.types import OperatorCommand, Outcome
 from companion.model.verdict import Answer
 from companion.sitl_config.team import load_team
-from sitl.fast.loop import FastResult
+from sitl.fast.result import FastResult
 from sitl.fast.team import FastTeam, TeamResult
 
 IDEAL = "ideal"

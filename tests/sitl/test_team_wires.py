@@ -12,7 +12,7 @@ from companion.model.team import ClampCommand
 from companion.model.types import IDENTITY_QUAT
 from companion.runtime.clock import flight_clock
 from companion.sitl_config.team import load_team
-from sitl.plant import MocapFrame
+from sitl.mocap import MocapFrame
 from sitl.server import Sitl
 from sitl.wires import MachineWires, Ports
 from sitl.world.start import start_of

@@ -9,7 +9,8 @@ import pytest
 
 from companion.model.types import Outcome
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from sitl.world.payload import Payload
 from sitl.world.throws import with_throws
 from tests.support import SHORT_CATCH

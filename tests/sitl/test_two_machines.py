@@ -79,9 +79,9 @@ def test_each_machine_has_wires_of_its_own_and_one_server_sees_both() -> None:
 
 def test_a_machine_whose_poses_are_lost_is_missing_in_the_frames() -> None:
     server = server_of()
-    right, loss = server.machines[1], Fault(kind="mocap_loss", t_s=0.0, after="start")
-    right.plant.fault = lambda kind: loss if kind == "mocap_loss" else None  # type: ignore[method-assign]
-    right.plant.faults = None
+    right = server.machines[1]
+    right.faults.active["mocap_loss"] = Fault(kind="mocap_loss", t_s=0.0, after="start")
+    right.plant.inject(right.faults)
     _, frames = run_for(server, 20)
     ids = {pose.id for frame in frames for pose in frame}
     assert server.machines[0].vehicle.devices.mocap.rigid_body_id in ids

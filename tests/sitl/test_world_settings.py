@@ -19,7 +19,8 @@ from companion.sitl_config.faults import CONTACT_PHASES, KINDS, FaultKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from companion.sitl_config.team import load_team
 from companion.sitl_config.world import World
-from sitl.fast.loop import FastFlight, FastResult
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from sitl.fast.team import FastTeam
 from tests.support import HOVER, SHORT_CATCH, set_options
 

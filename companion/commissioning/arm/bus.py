@@ -1,6 +1,6 @@
 """Reads and writes registers of any servo on a bus, at any baud rate. All calls block; nothing here switches torque on.
 
-Uses dynamixel-sdk on the flight's own port (`companion.io.dynamixel.registers.ServoPort`).
+Uses dynamixel-sdk on the flight's own port (`companion.io.dynamixel.port.ServoPort`).
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Final, Self, get_args
 
 from companion.config.devices import ServoBaud
-from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.access import ServoAccess
+from companion.io.dynamixel.port import ServoPort
 from companion.io.dynamixel.registers import Register
 from companion.io.protocols import DeviceError
 
@@ -34,7 +34,7 @@ _REPLY_TIMEOUT_MS: Final = 100.0
 """Timeout for an answer: an FTDI adapter with its factory latency timer delays it by 16 ms, a busy computer by more."""
 
 
-class _CountingPort(dxl.ServoPort):
+class _CountingPort(ServoPort):
     """Serial port that counts received bytes, to distinguish noise from silence."""
 
     came_bytes = 0

@@ -28,6 +28,7 @@ from companion.config.devices import ArmDevice
 from companion.config.document import Data
 from companion.config.vehicle import Vehicle
 from companion.io.dynamixel import registers as dxl
+from companion.io.dynamixel.port import usb_latency_ms
 from companion.io.protocols import DeviceError
 from companion.model.check_row import Row
 from companion.model.servos import hardware_error_text, kind_of, model_text
@@ -104,7 +105,7 @@ def scan(
             unreadable = any(kind_of(one.model) is not None and not one.registers for one in found)
             if answers.garbled or unreadable:
                 garbled.append(baud)
-    return Scan(tuple(tried), tuple(servos), tuple(garbled), dxl.usb_latency_ms(device.port, sysfs))
+    return Scan(tuple(tried), tuple(servos), tuple(garbled), usb_latency_ms(device.port, sysfs))
 
 
 def _read(talk: ServoTalk, servo_id: int, model: int, firmware: int) -> FoundServo:

@@ -25,7 +25,7 @@ from companion.commissioning.tool import SENSORS, Cancelled, Report, Session, To
 from companion.config.device_plugins import RFT60
 from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
-from companion.io.dynamixel.registers import usb_latency_ms
+from companion.io.dynamixel.port import usb_latency_ms
 from companion.io.protocols import DeviceError
 from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2

@@ -12,7 +12,8 @@ from typing import Final
 
 from dynamixel_sdk import COMM_SUCCESS, PacketHandler
 
-from companion.io.dynamixel.registers import Register, ServoPort
+from companion.io.dynamixel.port import ServoPort
+from companion.io.dynamixel.registers import Register
 from companion.io.protocols import DeviceError
 
 ATTEMPTS: Final = 10

@@ -19,8 +19,9 @@ from companion.io.dynamixel import packets
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.access import ATTEMPTS, ERROR_NUMBER, ServoAccess
 from companion.io.dynamixel.jaws import JawsServo
+from companion.io.dynamixel.port import servo_port, usb_latency_ms
 from companion.io.dynamixel.registers import Block, JawsBlock, Register
-from companion.io.dynamixel.scale import RAD_PER_COUNT, JointScale
+from companion.io.dynamixel.scale import RAD_PER_COUNT, JointScale, joint_scale, turn_offset_counts
 from companion.io.protocols import DeviceError
 from companion.io.reopening import Reopening
 from companion.model.observations import ServoReport
@@ -57,7 +58,7 @@ class ArmBus:
         self._limp = (0,) * len(arm.joints)
         self._aborted = aborted
         self._ids = [joint.servo_id for joint in arm.joints]
-        self._port = dxl.servo_port(device.port)
+        self._port = servo_port(device.port)
         names = {joint.servo_id: f"servo {joint.servo_id} (joint {n})" for n, joint in enumerate(arm.joints, 1)}
         if jaws is not None:
             names[jaws.servo_id] = f"servo {jaws.servo_id} (clamp)"
@@ -239,7 +240,7 @@ class ArmBus:
         self._port.baudrate = self._device.baud
         if not self._port.openPort():
             raise self._error("port", f"dynamixel-sdk does not know baud rate {self._device.baud}")
-        latency_ms = dxl.usb_latency_ms(self._device.port)
+        latency_ms = usb_latency_ms(self._device.port)
         if latency_ms is not None and latency_ms > _USB_LATENCY_MAX_MS:
             raise self._error(
                 "USB adapter",
@@ -292,7 +293,7 @@ class ArmBus:
             if self._servos.read(joint.servo_id, register) != value:  # EEPROM wears
                 self._servos.write(joint.servo_id, register, value)
         try:
-            scale = dxl.joint_scale(joint, torque_per_amp_nm_a, self._servos.read(joint.servo_id, dxl.CURRENT_LIMIT))
+            scale = joint_scale(joint, torque_per_amp_nm_a, self._servos.read(joint.servo_id, dxl.CURRENT_LIMIT))
         except ValueError as error:
             raise self._servos.error(joint.servo_id, str(error)) from error
         pointers = dxl.pointers(dxl.BLOCK)
@@ -303,7 +304,7 @@ class ArmBus:
         return scale
 
     def _within_limits(self, joint: Joint, scale: JointScale, block: Block) -> JointScale:
-        zero_count = joint.zero_count + dxl.turn_offset_counts(joint, block.position_count)
+        zero_count = joint.zero_count + turn_offset_counts(joint, block.position_count)
         scale = JointScale(scale.sign, zero_count, scale.torque_nm_per_count, scale.current_max_counts)
         angle_deg = scale.angle_rad(block.position_count) * 360.0 / (COUNTS_PER_TURN * RAD_PER_COUNT)
         low_deg, high_deg = joint.angle_deg

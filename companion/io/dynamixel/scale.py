@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
+from companion.config.arm import Joint
+from companion.io.dynamixel.registers import CURRENT_LIMIT
 from companion.model.servos import COUNTS_PER_TURN, RPM_PER_COUNT
 
 RAD_PER_COUNT: Final = 2.0 * math.pi / COUNTS_PER_TURN
@@ -44,3 +46,40 @@ class JointScale:
             raise ValueError(f"joint torque {torque_nm} is not finite")
         limit = self.current_max_counts
         return max(-limit, min(limit, round(self.sign * torque_nm / self.torque_nm_per_count)))
+
+
+def joint_scale(joint: Joint, torque_per_amp_nm_a: float, current_limit_counts: int) -> JointScale:
+    """Return the scale of a joint.
+
+    Args:
+        joint: limits, zero, direction and model of its servo.
+        torque_per_amp_nm_a: torque constant of its servo, N m/A.
+        current_limit_counts: current limit of its servo (register 38).
+
+    Raises:
+        ValueError: the current limit is below what `torque_max_nm` needs.
+    """
+    torque_nm_per_count = torque_per_amp_nm_a * joint.kind.current_unit_a
+    wanted = math.floor(joint.torque_max_nm / torque_nm_per_count + 1e-9)
+    if wanted > current_limit_counts:
+        raise ValueError(
+            f"{CURRENT_LIMIT} is {current_limit_counts}, which is {current_limit_counts * torque_nm_per_count:.2f} N m; "
+            f"torque_max_nm {joint.torque_max_nm:g} needs {wanted}: raise the register or lower torque_max_nm"
+        )
+    return JointScale(joint.sign, joint.zero_count, torque_nm_per_count, wanted)
+
+
+def turn_offset_counts(joint: Joint, position_count: int) -> int:
+    """Return the whole turns, in counts, to add to `zero_count` so that the joint angle lies within its limits, or 0 if none fits.
+
+    The encoder measures the angle within one turn; the servo loses the number of turns when it is switched off. A joint with less than
+    one turn between its limits is still unambiguous.
+    """
+    low_deg, high_deg = joint.angle_deg
+    if high_deg - low_deg >= 360.0:
+        return 0
+    angle_deg = joint.sign * (position_count - joint.zero_count) * 360.0 / COUNTS_PER_TURN
+    turns = math.ceil((low_deg - angle_deg) / 360.0)
+    if angle_deg + 360.0 * turns > high_deg:
+        return 0
+    return -joint.sign * turns * COUNTS_PER_TURN

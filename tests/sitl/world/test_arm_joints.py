@@ -182,7 +182,8 @@ def plant_of(joints: int, **config: Any) -> tuple[Plant, FastBus, list[Any], Fau
     drives = [servo.drive for servo in servos]
     plant = Plant(vehicle, world, FixedRotors(), drives, Start((0.0, 0.0), 0.0, folded_rad(joints)))
     faults = Faults(world, plant.scene, plant.machine, stub_of(world, vehicle.airframe), drives, vehicle.tether)
-    plant.faults = faults if world.faults else None
+    if world.faults:
+        plant.inject(faults)
     return plant, FastBus(drives, scales_of(vehicle, servos), 0.1, plant.faults), drives, faults
 
 

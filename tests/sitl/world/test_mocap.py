@@ -43,7 +43,7 @@ def test_the_plant_streams_pivot_yaw_and_tilt() -> None:
     frames = []
     for _ in range(20):
         plant.step(False)
-        frames += plant.take_mocap()
+        frames += plant.mocap.take()
     (x, y, _), truth = frames[-1].position_world_m, plant.truth
     assert x - truth.position_world_m[0] == pytest.approx(0.01, abs=1e-4)
     assert y - truth.position_world_m[1] == pytest.approx(0.0, abs=1e-4)
