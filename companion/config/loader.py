@@ -11,18 +11,14 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
-from companion.config import device_plugins
 from companion.config.arm import NO_ARM
 from companion.config.base import Location, Model
 from companion.config.controller import LAWS, PRESETS, AnyControllerConfig, ControllerConfig, law_class, preset_file
-from companion.config.device_plugins import DYNAMIXEL
-from companion.config.devices import ANY_INTERFACE
+from companion.config.device_checks import missing_on_hardware, unusable_devices
 from companion.config.document import (
     RANK_MISSING,
-    RANK_VALUE,
     ConfigError,
     Document,
-    Problem,
     key_path,
     problem_lines,
 )
@@ -34,7 +30,6 @@ from companion.config.shipped import named_file, near
 from companion.config.urdf import read_urdf
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
-from companion.plugins import ARMS, FORCE_SENSORS, MOCAP_SYSTEMS
 
 M = TypeVar("M", bound=Model)
 
@@ -105,7 +100,7 @@ def load_flight(
     if vehicle_file is not None:
         vehicle = _check_vehicle(vehicle_file, parsed, of_vehicle)
         if hardware and vehicle is not None:
-            of_vehicle += _missing_on_hardware(vehicle, vehicle_file) + _unusable_devices(vehicle, vehicle_file)
+            of_vehicle += missing_on_hardware(vehicle, vehicle_file) + unusable_devices(vehicle, vehicle_file)
     _place_arm(mission_file, vehicle)
     mission = validated(Mission, mission_file, lines)
     lines += of_vehicle
@@ -153,7 +148,7 @@ def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
     document = read_document(named_file("vehicles", path, "--vehicle"))
     vehicle = _check_vehicle(document, parse_overrides(overrides), lines)
     if vehicle is not None:
-        lines += _unusable_devices(vehicle, document)
+        lines += unusable_devices(vehicle, document)
     if vehicle is None or lines:
         raise ConfigError(lines)
     return vehicle
@@ -247,53 +242,6 @@ def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
         elif isinstance(given, list) and vehicle is not None and len(given) != len(vehicle.arm.joints):
             text = f"expected {len(vehicle.arm.joints)} joint angles, as many as the vehicle has, got {len(given)}"
             document.report(place, text)
-
-
-def _missing_on_hardware(vehicle: Vehicle, document: Document) -> list[str]:
-    """Return messages if motion capture is received from every network, where any sender could use Motive's address, or nothing says
-    where the other vehicle of a team is and with which key it signs.
-    """
-    found: list[tuple[Location, str]] = []
-    mocap, link = vehicle.devices.mocap, vehicle.devices.team
-    if mocap.interface == ANY_INTERFACE and not mocap.external:
-        text = f'expected the address of this computer on the camera network, got "{mocap.interface}" (every network); '
-        text += "`ip -4 address` shows it, `companion mocap check` proposes it"
-        found.append((("devices", "mocap", "interface"), text))
-    if link is not None and link.partner is None:
-        text = "missing; expected the IPv4 address of the other vehicle's computer"
-        found.append((("devices", "team", "partner"), text))
-    if link is not None and link.key_file is None:
-        found.append(
-            (("devices", "team", "key_file"), "missing; expected the file of the key that both vehicles share")
-        )
-    return problem_lines(
-        [
-            Problem(RANK_VALUE, document.origin(at), f"{key_path(at)}: {text}; flights with --sitl do not need it")
-            for at, text in found
-        ]
-    )
-
-
-def _unusable_devices(vehicle: Vehicle, document: Document) -> list[str]:
-    """Return messages if a device is of a type that is not installed, or its options are invalid. Logs are read without this check."""
-    found: list[tuple[Location, str]] = []
-    for name, group, device in (
-        ("mocap", MOCAP_SYSTEMS, vehicle.devices.mocap),
-        ("force", FORCE_SENSORS, vehicle.devices.force),
-        ("arm", ARMS, vehicle.devices.arm),
-    ):
-        if device is not None:
-            problems = device_plugins.problems(group, device.type, device.options)
-            found += [(("devices", name, *at), text) for at, text in problems]
-    mocap = vehicle.devices.mocap
-    if mocap.ball is not None and not found and not device_plugins.sees_markers(mocap.type):
-        text = f"the motion-capture system {mocap.type} hands on no markers, so that no ball can be followed; remove it"
-        found.append((("devices", "mocap", "ball"), text))
-    if vehicle.devices.arm is not None and vehicle.devices.arm.type == DYNAMIXEL:
-        text = f"expected the model of the servo, because devices.arm.type is {DYNAMIXEL}, got null"
-        joints = enumerate(vehicle.arm.joints)
-        found += [(("arm", "joints", index, "servo"), text) for index, joint in joints if joint.servo is None]
-    return problem_lines([Problem(RANK_VALUE, document.origin(at), f"{key_path(at)}: {text}") for at, text in found])
 
 
 def _check_controller(document: Document, overrides: list[Override], lines: list[str]) -> ControllerConfig | None:
