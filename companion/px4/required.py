@@ -11,7 +11,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.check_row import Level
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.flight_stage import SPOOL_S
-from companion.px4.wanted import Value, Wanted, between
+from companion.px4.wanted import Value, Wanted
 
 HOVER = "MPC_THR_HOVER"
 ROTOR_COUNT = "CA_ROTOR_COUNT"
@@ -87,12 +87,12 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             5.0,
             "delay from exposure to arrival, ms; if it is wrong, the estimate oscillates with the vehicle's motion",
             reboot=True,
-            limits=between(0.0, 30.0),
+            limits=(0.0, 30.0),
             measured=True,
         ),
-        Wanted("EKF2_ASP_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=between(0.0, 50.0)),
-        Wanted("EKF2_GPS_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=between(0.0, 50.0)),
-        *(Wanted(f"SENS_GPS{n}_DELAY", 5, _RAISES, _WARN, reboot=True, limits=between(0.0, 50.0)) for n in (0, 1)),
+        Wanted("EKF2_ASP_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=(0.0, 50.0)),
+        Wanted("EKF2_GPS_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=(0.0, 50.0)),
+        *(Wanted(f"SENS_GPS{n}_DELAY", 5, _RAISES, _WARN, reboot=True, limits=(0.0, 50.0)) for n in (0, 1)),
         Wanted(
             "EKF2_DELAY_MAX",
             50.0,
@@ -100,22 +100,22 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "EKF2_TAU_POS and EKF2_TAU_VEL), the estimate drifts by 3 to 4 mm",
             _WARN,
             reboot=True,
-            limits=between(30.0, 60.0),
+            limits=(30.0, 60.0),
         ),
-        *(Wanted(f"EKF2_TAU_{of}", 0.1, _FOLLOWS, _WARN, limits=between(0.1, 0.15)) for of in ("POS", "VEL")),
+        *(Wanted(f"EKF2_TAU_{of}", 0.1, _FOLLOWS, _WARN, limits=(0.1, 0.15)) for of in ("POS", "VEL")),
         Wanted(
             "EKF2_EVP_NOISE",
             0.01,
             "noise of the position, m; if it is much larger, the estimate follows the drift of the IMU instead of motion capture",
             _WARN,
-            limits=between(0.005, 0.05),
+            limits=(0.005, 0.05),
         ),
         Wanted(
             "EKF2_EVA_NOISE",
             0.05,
             "noise of the attitude, rad; if it is much larger, yaw lags behind motion capture",
             _WARN,
-            limits=between(0.01, 0.1),
+            limits=(0.01, 0.1),
         ),
         Wanted(
             "EKF2_EV_QMIN",
@@ -127,7 +127,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
                 f"EKF2_EV_POS_{axis}",
                 0.0,
                 "offset of the body's pivot from PX4's centre of mass, m; it shifts the estimate when the vehicle tilts",
-                limits=between(-0.02, 0.02),
+                limits=(-0.02, 0.02),
             )
             for axis in "XYZ"
         ),
@@ -144,7 +144,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "natural frequency of the model that attitude setpoints pass, rad/s; with PX4's 50 they lag by 40 ms, and the attitude "
             "error doubles (3.0 instead of 1.6 deg in the catch)",
             _WARN,
-            limits=between(150.0, 1000.0),
+            limits=(150.0, 1000.0),
         ),
     ),
     "Loss of the companion": (
@@ -153,7 +153,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             0.5,
             "time without a setpoint until the failsafe, s; if longer, the vehicle continues at its last attitude; if shorter, "
             "one delayed packet ends the flight",
-            limits=between(0.2, 0.5),
+            limits=(0.2, 0.5),
         ),
         Wanted(
             "COM_OBL_RC_ACT",
@@ -175,7 +175,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             0.5,
             "time from the kill switch until PX4 disarms, s; a switch that is released before starts the rotors again, and PX4's "
             "own landing, which the fall has misled, may lift the vehicle",
-            limits=between(0.0, 1.0),
+            limits=(0.0, 1.0),
         ),
         Wanted(
             "NAV_RCL_ACT",
@@ -277,26 +277,26 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "COM_SPOOLUP_TIME",
             1.0,
             "time after arming for which PX4 limits the thrust, s, while the companion spools up",
-            limits=between(0.0, SPOOL_S),
+            limits=(0.0, SPOOL_S),
         ),
         Wanted(
             "COM_DISARM_LAND",
             2.0,
             "time from PX4's own landing until it disarms, s; if it is 0 or less, the rotors continue to turn",
-            limits=between(0.1, 5.0),
+            limits=(0.1, 5.0),
         ),
         Wanted(
             "COM_DISARM_PRFLT",
             10.0,
             "time after arming within which the vehicle must take off, s; if it is too short, PX4 disarms during spool-up",
-            limits=between(5.0, 60.0),
+            limits=(5.0, 60.0),
         ),
         Wanted(
             "MPC_LAND_SPEED",
             0.7,
             "descent speed of PX4's own landing, m/s; the net touches down first",
             _WARN,
-            limits=between(0.3, 1.0),
+            limits=(0.3, 1.0),
         ),
         Wanted(
             "MIS_TAKEOFF_ALT",
@@ -313,7 +313,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             25.0,
             "tilt limit of PX4's own modes, deg; if larger, PX4 may cross the room fast after a takeover",
             _WARN,
-            limits=between(20.0, 45.0),
+            limits=(20.0, 45.0),
         ),
         Wanted(
             "MPC_ACC_HOR",
@@ -321,28 +321,28 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "acceleration, m/s^2; if it is smaller, LAND stops further ahead (0.53 m after a takeover with PX4's default of 3); "
             "MPC_JERK_AUTO and MPC_TILTMAX_AIR keep the actual acceleration below it",
             _WARN,
-            limits=between(5.0, 10.0),
+            limits=(5.0, 10.0),
         ),
         Wanted(
             "MPC_JERK_AUTO",
             6.0,
             "jerk, m/s^3; if smaller, PX4 brakes later; if larger, LAND approaches its stop point faster",
             _WARN,
-            limits=between(4.0, 8.0),
+            limits=(4.0, 8.0),
         ),
         Wanted(
             "MPC_XY_VEL_MAX",
             2.0,
             "horizontal speed, m/s; if larger, there is not enough distance to stop",
             _WARN,
-            limits=between(0.5, 3.0),
+            limits=(0.5, 3.0),
         ),
         Wanted(
             "MPC_Z_VEL_MAX_UP",
             1.0,
             "climb speed, m/s; if larger, there is not enough distance to stop below the ceiling",
             _WARN,
-            limits=between(0.5, 2.0),
+            limits=(0.5, 2.0),
         ),
     ),
     "Serial link to the companion: TELEM2": (
@@ -369,7 +369,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             _WARN,
             reboot=True,
             hardware=True,
-            limits=between(60000.0, 92160.0),
+            limits=(60000.0, 92160.0),
         ),
         Wanted(
             "SER_TEL2_BAUD",

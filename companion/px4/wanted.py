@@ -11,7 +11,8 @@ from companion.model.check_row import Level
 _RELATIVE = 1e-6
 
 Value = float | int
-Limits = Callable[[Vehicle], tuple[float, float]]
+Limits = tuple[float, float] | Callable[[Vehicle], tuple[float, float]]
+"""Lowest and highest accepted value: the same for every vehicle, or computed from the vehicle file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,13 +45,17 @@ class Wanted:
         """Return whether this vehicle can fly with the value in PX4."""
         if self.ok:
             return value in self.ok
-        if self.limits is None:
+        limits = self.limits_for(vehicle)
+        if limits is None:
             assert self.value is not None
-            low = high = float(self.value)
-        else:
-            low, high = self.limits(vehicle)
+            limits = (float(self.value), float(self.value))
+        low, high = limits
         slack = _RELATIVE * max(abs(low), abs(high), _RELATIVE)
         return low - slack <= value <= high + slack
+
+    def limits_for(self, vehicle: Vehicle) -> tuple[float, float] | None:
+        """Return the lowest and highest accepted value; None without limits."""
+        return self.limits(vehicle) if callable(self.limits) else self.limits
 
     def text(self, vehicle: Vehicle | None = None) -> str:
         """Return the accepted values for display. Without a vehicle, limits that depend on it are described in words."""
@@ -58,16 +63,10 @@ class Wanted:
             return " or ".join(f"{value}" for value in self.ok)
         if self.limits is None:
             return f"{self.value:g}"
-        if vehicle is None and self.limits_text:
+        if not callable(self.limits):
+            low, high = self.limits
+        elif vehicle is None:
             return self.limits_text
-        low, high = self.limits(vehicle) if vehicle is not None else self.limits(NO_VEHICLE)
+        else:
+            low, high = self.limits(vehicle)
         return " to ".join(f"{end:.3f}".rstrip("0").rstrip(".") for end in (low, high))
-
-
-NO_VEHICLE: Vehicle = None  # type: ignore[assignment]
-"""Placeholder vehicle for limits that do not depend on it."""
-
-
-def between(low: float, high: float) -> Limits:
-    """Return limits that are the same for every vehicle."""
-    return lambda _: (low, high)

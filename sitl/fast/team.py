@@ -40,8 +40,8 @@ class FastTeam:
         configs = [each for _, each in config.members]
         self.scene = pair_scene(configs)
         self.flights = tuple(
-            FastFlight(each, told, scene=self.scene, number=number)
-            for number, (each, told) in enumerate(zip(configs, commands, strict=True))
+            FastFlight(each, own, scene=self.scene, number=number)
+            for number, (each, own) in enumerate(zip(configs, commands, strict=True))
         )
         self._links = (_Link(), _Link())
         """What each member has sent and the other has not received yet."""

@@ -167,8 +167,8 @@ async def _count(
 
 def _max_ms(vehicle: Vehicle) -> float:
     """Return the largest delay that the preflight accepts."""
-    limits = next(one.limits for one in WANTED if one.name == PARAMETER)
-    return math.inf if limits is None else limits(vehicle)[1]
+    limits = next(one.limits_for(vehicle) for one in WANTED if one.name == PARAMETER)
+    return math.inf if limits is None else limits[1]
 
 
 def judge(m: Measured, vehicle: Vehicle) -> Report:

@@ -12,7 +12,6 @@ from companion.px4.defaults import PX4_DEFAULTS
 from companion.px4.params_file import Value, same
 from companion.px4.required import BY_NAME
 from companion.px4.versions import varies
-from companion.px4.wanted import NO_VEHICLE
 
 
 class ParamLink(Protocol):
@@ -105,9 +104,9 @@ def compare(
 def _is_measured(difference: Difference) -> bool:
     """Return whether PX4's value was measured while the file has the project's initial value."""
     wanted = BY_NAME.get(difference.name)
-    if wanted is None or not wanted.measured or wanted.value is None or wanted.limits is None:
+    if wanted is None or not wanted.measured or wanted.value is None or not isinstance(wanted.limits, tuple):
         return False
-    low, high = wanted.limits(NO_VEHICLE)
+    low, high = wanted.limits
     begun = same(difference.file, wanted.value) and not same(difference.px4, PX4_DEFAULTS[difference.name])
     return begun and low <= difference.px4 <= high
 

@@ -42,7 +42,7 @@ class Releasing(Record, frozen=True, kw_only=True):
     over_bar: bool = True
     """Whether a landing must first move away from the bar."""
     open: bool = False
-    told: bool = False
+    reported: bool = False
 
 
 class Release(Phase):
@@ -93,9 +93,9 @@ class Release(Phase):
         waited_s = air.t_s - s.begun_s
         if waited_s >= 0.5 * OPENING_S:
             air.move_to(air.engaged.start_s)
-        if waited_s >= OPEN_MAX_S and not s.told:
+        if waited_s >= OPEN_MAX_S and not s.reported:
             air.report(NOT_RELEASED, f"the clamp has not opened within {OPEN_MAX_S:g} s; waiting")
-            s = replace(s, told=True)
+            s = replace(s, reported=True)
         return s
 
     def expects(self, own: Any) -> Expectation:
