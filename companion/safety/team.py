@@ -67,8 +67,10 @@ def partner_holds(t: TeamTracker, _: None) -> Values | None:
 
 
 def partner_lands(t: TeamTracker, _: None) -> Values | None:
-    """Fires if the other vehicle lands because of an event while both hold the bar."""
-    return HOLDS if t.said is not None and t.said.lands and t.grip in HELD else None
+    """Fires if the other vehicle lands because of an event, or PX4 lands it, while this one holds the bar."""
+    if t.said is None or t.grip not in HELD:
+        return None
+    return HOLDS if t.said.lands or t.said.px4_lands else None
 
 
 def partner_let_go(t: TeamTracker, _: None) -> Values | None:

@@ -63,14 +63,21 @@ def test_velocity_and_acceleration_of_a_turning_end_are_those_of_its_path() -> N
             assert now.acceleration_world_m_s2[axis] == pytest.approx((v[1] - v[0]) / (2 * STEP_S), abs=1e-3)
 
 
-def test_a_bar_that_brings_the_rotors_together_is_refused() -> None:
+@pytest.mark.parametrize(
+    ("bar", "said"),
+    [({"length_m": 0.8}, "two rotor circles"), ({"handle_height_m": 0.24}, "make the feet shorter: at most 0.23 m")],
+    ids=["short", "high"],
+)
+def test_a_bar_that_brings_the_rotors_together_or_reaches_into_them_is_refused(
+    bar: dict[str, float], said: str
+) -> None:
     config = load_team("carry").left
     grip = config.mission.phases[1]
-    short = grip.model_copy(update={"bar": grip.bar.model_copy(update={"length_m": 0.8})})  # type: ignore[attr-defined]
+    other = grip.model_copy(update={"bar": grip.bar.model_copy(update=bar)})  # type: ignore[attr-defined]
     mission = config.mission.model_copy(
-        update={"phases": (config.mission.phases[0], short, *config.mission.phases[2:])}
+        update={"phases": (config.mission.phases[0], other, *config.mission.phases[2:])}
     )
-    assert any("two rotor circles" in line for line in check_mission(mission, config.vehicle))
+    assert any(said in line for line in check_mission(mission, config.vehicle))
 
 
 def test_a_mission_for_two_is_not_flown_by_one() -> None:

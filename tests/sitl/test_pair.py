@@ -108,6 +108,18 @@ def test_a_member_whose_process_is_killed_brings_both_down() -> None:
     assert_both_down_unharmed(team)
 
 
+def test_a_member_that_px4_lands_blindly_is_not_waited_for_and_does_not_descend_into_its_handle() -> None:
+    team, result = flown("right.world.faults=[{kind: mocap_occluded, t_s: 12.5}]")
+    left, right = result.members
+    assert {"mocap_invalid", "bar_let_go"} <= set(ids(right))
+    (holds_s, lands_s) = (
+        next(e.t_s for o in left.outputs for e in o.events if e.id == name)
+        for name in ("partner_holds", "partner_lands")
+    )
+    assert lands_s == holds_s
+    assert_both_down_unharmed(team)
+
+
 def test_a_bar_too_far_from_its_place_is_not_gripped_and_both_land_beside_it() -> None:
     team, result = flown("mission.phases[1].wait_max_s=5", "left.world.bar={pivot_offset_m: [0.3, 0.0, 0.0]}")
     assert [ids(member) for member in result.members] == 2 * [["takeoff", "not_gripped", "touchdown"]]

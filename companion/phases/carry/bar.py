@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
@@ -18,6 +18,10 @@ from companion.model.types import Joints, Vec3
 End = Literal["left", "right"]
 """The end of the bar that a vehicle holds. The bar's yaw is that of the direction from its right to its left end; the first member of a
 team has the left one."""
+
+
+HANDLE_BELOW_M: Final = 0.1
+"""Least distance of a standing bar's handles below the rotors of a vehicle that stands, too."""
 
 
 class Bar(Model):
@@ -83,6 +87,13 @@ def problems_of(vehicle: Vehicle, bar: Bar) -> Iterator[str]:
         return
     if vehicle.devices.force is None:
         yield f"carries a bar by the measured force, but vehicle '{vehicle.name}' has no force sensor (devices.force)"
+    airframe = vehicle.airframe
+    rotors_m = airframe.ground_clearance_m + min(z for _, _, z in airframe.rotor_layout.positions_body_m)
+    if bar.handle_height_m > rotors_m - HANDLE_BELOW_M:
+        yield (
+            f"grips handles {bar.handle_height_m:g} m above the floor, into which the rotors of a vehicle that PX4 lands there would "
+            f"descend (to {rotors_m:g} m); make the feet shorter: at most {rotors_m - HANDLE_BELOW_M:.2f} m"
+        )
     if bar.mass_max_kg > 2.0 * vehicle.airframe.payload_max_kg:
         yield (
             f"lifts half of a bar of {bar.mass_max_kg:g} kg, but vehicle '{vehicle.name}' carries at most "
