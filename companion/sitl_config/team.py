@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.config.document import ConfigError, Document
+from companion.config.ground import topic_name
 from companion.config.loader import validated
 from companion.config.overrides import Override, override_of
 from companion.config.shipped import named_file
@@ -74,7 +75,7 @@ def load_team(
     configs: dict[str, SitlConfig] = {}
     for end in ENDS:
         member: Member = getattr(team.members, end)
-        own = [*_overrides_of(end, member, document, grips), *_of_member(end, overrides)]
+        own = [*_overrides_of(team.name, end, member, document, grips), *_of_member(end, overrides)]
         if end == "right" and configs:
             origin = document.origin(("members", end))
             own.append(override_of("world.seed", configs["left"].world.seed + SEED_APART, origin))
@@ -125,7 +126,9 @@ def _grips_of(mission: Path, document: Document) -> list[int]:
     return found
 
 
-def _overrides_of(end: End, member: Member, document: Document, grips: Sequence[int]) -> Iterator[str | Override]:
+def _overrides_of(
+    team: str, end: End, member: Member, document: Document, grips: Sequence[int]
+) -> Iterator[str | Override]:
     """Yield what a member has of its own."""
     at = document.origin(("members", end))
     for index in grips:
@@ -134,5 +137,6 @@ def _overrides_of(end: End, member: Member, document: Document, grips: Sequence[
     other = "right" if end == "left" else "left"
     yield override_of("vehicle.devices.team.port", ports[end], at)
     yield override_of("vehicle.devices.team.partner_port", ports[other], at)
+    yield override_of("vehicle.ground.topic", topic_name(None, f"{team}-{end}"), at)
     for name, value in member.set.items():
         yield override_of(name, json.loads(json.dumps(value)), document.key_origin(("members", end, "set", name)))

@@ -47,6 +47,7 @@ def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
             "both members have devices.mocap.rigid_body_id 1; give each vehicle a rigid body of its own",
         ),
         (["right.vehicle.devices.team.port=14700"], "both members have devices.team.port 14700"),
+        (["right.vehicle.ground.topic=carry-left"], "both members have ground.topic carry-left; give each"),
         (["right.mission.phases[2].lift_m=0.3"], "both members must fly the same phases after grip"),
         (["left.vehicle.devices.mocap.server=192.168.1.11"], "devices.mocap.server differs between the members"),
         (
@@ -55,7 +56,7 @@ def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
         ),
         (["mission.phases[1].bar.length_m=0.6"], "the vehicles come as near as "),
     ],
-    ids=["one body", "one port", "other phases", "two servers", "tethers", "short bar"],
+    ids=["one body", "one port", "one name", "other phases", "two servers", "tethers", "short bar"],
 )
 def test_members_that_do_not_go_together_are_refused_in_one_line(overrides: list[str], said: str) -> None:
     (line,) = problems(*overrides)

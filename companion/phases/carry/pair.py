@@ -24,6 +24,12 @@ def pair_problems(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
     for what, one, other, advice in (
         ("devices.mocap.rigid_body_id", _body(left), _body(right), "give each vehicle a rigid body of its own"),
         (
+            "ground.topic",
+            left.vehicle.ground.topic,
+            right.vehicle.ground.topic,
+            "give each vehicle a name of its own on the broker",
+        ),
+        (
             "devices.team.port",
             _port(left),
             _port(right),
