@@ -6,20 +6,21 @@ import functools
 from collections.abc import Mapping, Sequence
 
 import pytest
+from msgspec.structs import replace
 
-from companion.model.team import Grip
+from companion.model.outputs import Outputs
+from companion.model.team import Grip, TeamState
 from companion.model.types import OperatorCommand, Outcome
 from companion.model.verdict import Answer
 from companion.sitl_config.team import load_team
 from sitl.fast.result import FastResult
 from sitl.fast.team import FastTeam, TeamResult
 
+Commands = Sequence[Mapping[float, OperatorCommand]]
 IDEAL = "ideal"
 
 
-def flown(
-    *overrides: str, world: str = IDEAL, commands: Sequence[Mapping[float, OperatorCommand]] = ({}, {})
-) -> tuple[FastTeam, TeamResult]:
+def flown(*overrides: str, world: str = IDEAL, commands: Commands = ({}, {})) -> tuple[FastTeam, TeamResult]:
     team = FastTeam(load_team("carry", [*SHORT, *overrides], world=world), commands)
     return team, team.run()
 
@@ -86,6 +87,28 @@ def test_a_hold_of_both_ends_at_one_instant_once_each_that_was_commanded_is_resu
     assert abs(went_on[0][0] - went_on[1][0]) <= 0.0051
     left, right = (times(member, Grip.STANDING) for member in result.members)
     assert abs(left[0] - right[0]) <= 0.0051, "both have continued at one place of their plans"
+
+
+def test_members_that_are_far_apart_in_their_plans_do_not_continue_but_land_when_the_hold_expires() -> None:
+    """What the left one announces is 5 s ahead: followed, the right one would leave its end of the bar."""
+    commands: Commands = ({17.5: OperatorCommand.HOLD, 18.5: OperatorCommand.RESUME}, {})
+    team = FastTeam(load_team("carry", [*SHORT, "vehicle.safety.hold_max_s=3"], world=IDEAL), commands)
+    left = team.flights[0]
+    announced = left.announced
+
+    def ahead(outputs: Outputs | None) -> TeamState | None:
+        said = announced(outputs)
+        if said is None:
+            return None
+        return replace(said, together=replace(said.together, plan_s=said.together.plan_s + 5.0))
+
+    left.announced = ahead  # type: ignore[method-assign]
+    result = team.run()
+    for member in result.members:
+        assert "goes_on" not in ids(member)
+    assert "hold_expired" in ids(result.members[0])
+    assert outcomes(result) == [Outcome.ABORTED, Outcome.ABORTED]
+    assert_both_down_unharmed(team)
 
 
 def test_jaws_that_close_beside_the_handle_try_again_beside_it() -> None:

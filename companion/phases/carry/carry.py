@@ -40,6 +40,8 @@ BAR_LOST = EventDefinition(
 GOES_ON = EventDefinition(
     "goes_on", Severity.INFO, SafetyAction.NOMINAL, "both vehicles of a team continue after a hold, at one instant"
 )
+APART_MAX_S: Final = 0.5
+"""Longest time by which the two may be apart in their plans after a hold to continue; a hold stops them some 0.04 s apart."""
 STAND_S: Final = 0.5
 """Time at the end of the way after which the bar stands."""
 SET_DOWN_M: Final = 0.03
@@ -233,11 +235,15 @@ class Carry(Phase):
 
     def _going_on(self, air: Air, s: Carrying) -> Carrying:
         """Return the state with what the other vehicle must know of a hold; end the hold at the instant that the left one sets."""
-        together = Together(plan_s=air.plan_s(), waits=air.waits)
-        if not (air.waits and (said := _fresh(air)) is not None and said.together.waits):
+        said, now_s, plan_s = _fresh(air), server_s(air.i), air.plan_s()
+        # A vehicle that cannot continue, or that the other has left behind, says so by not waiting: the other then holds.
+        waits = air.waits and math.isfinite(now_s) and said is not None and said.holds
+        waits = waits and said is not None and abs(said.together.plan_s - plan_s) <= APART_MAX_S
+        together = Together(plan_s=plan_s, waits=waits)
+        if said is None or not (waits and said.together.waits):
             return replace(s, together=together)
         left = grip_of(air.phases[: air.engaged.index]).end == "left"
-        now_s, go_s = server_s(air.i), s.together.go_server_s if left else said.together.go_server_s
+        go_s = s.together.go_server_s if left else said.together.go_server_s
         if left and go_s is None:
             go_s = now_s + LIFT_AFTER_S
         if go_s is None or now_s < go_s:

@@ -267,8 +267,9 @@ class GripHandle(Phase):
             if partner.said.grip is Grip.CARRYING and s.lift_server_s is None:
                 return server_s(air.i)
             return partner.said.together.go_server_s or s.lift_server_s
-        if s.lift_server_s is None and partner.said.grip is Grip.READY:
-            return server_s(air.i) + LIFT_AFTER_S
+        now_s = server_s(air.i)
+        if s.lift_server_s is None and partner.said.grip is Grip.READY and math.isfinite(now_s):
+            return now_s + LIFT_AFTER_S
         return s.lift_server_s
 
     def _missing(self, s: Gripping) -> str:
