@@ -174,7 +174,7 @@ class _PhaseTick(Air):
         self._t.change(course=self._course.hold(self.t_s))
 
     def resume(self, notice: EventDefinition, text: str) -> None:
-        """End the hold, if the operator has said so to every vehicle that has begun one, and report it."""
+        """End the hold and report it. The phase calls this only after the operator has resumed each vehicle that began a hold."""
         self._t.report(notice, text)
         self._t.change(supervisor=SupervisorState(SafetyAction.NOMINAL, notice.id, self.t_s))
         self._t.change(course=self._course.resume(self.t_s))

@@ -175,7 +175,7 @@ class Air:
         raise NotImplementedError
 
     def resume(self, notice: EventDefinition, text: str) -> None:
-        """End the hold, if the operator has said so to every vehicle that has begun one, and report it."""
+        """End the hold and report it. The phase calls this only after the operator has resumed each vehicle that began a hold."""
         raise NotImplementedError
 
     def stay(self, segment: Segment) -> None:
