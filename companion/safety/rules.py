@@ -249,4 +249,14 @@ RULES: tuple[Rule, ...] = (
         predicate=team.bar_force_high, thresholds=("bar_force_max_n",), hold_time=0.3, ground=None, air=_LAND,
         message="the bar pulls with {:.1f} N (limit {:.1f} N)",
     ),
+    Rule(
+        id="bar_tilted", subject=Subject.PARTNER, what="one end of the bar in the air is much higher than the other",
+        predicate=team.bar_tilted, hold_time=0.2, ground=None, air=_HOLD,
+        message="the bar is tilted by {:.0f} deg (limit {:.0f} deg)",
+    ),
+    Rule(
+        id="bar_unseen", subject=Subject.PARTNER, what="motion capture does not see the bar in the air",
+        predicate=team.bar_unseen, ground=None, air=_WARN,
+        message="motion capture has not seen the bar for {:.1f} s; its tilt is not judged",
+    ),
 )  # fmt: skip

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from companion.model.frames import quat_rotate
 from companion.model.team import Grip, TeamState
 from companion.model.types import Inputs
 from companion.safety.flight_context import HOLDS, Age, FlightContext, Values
@@ -33,6 +34,11 @@ class TeamTracker:
         """Force of the bar on the clamp; 0 while it holds nothing."""
         self.apart_m = math.inf
         """Horizontal distance of the two vehicles; infinite if it is unknown."""
+        self._bar_age = Age()
+        self.bar_unseen_s = 0.0
+        """Awake time since motion capture has seen the bar that both carry; 0 while they carry none, and without a body of the bar."""
+        self.bar_tilt_deg = 0.0
+        """Angle between the bar that both carry and the horizontal; 0 if it is unknown."""
 
     def update(self, i: Inputs, context: FlightContext, awake_s: float) -> None:
         """Update with the inputs of one tick."""
@@ -47,6 +53,14 @@ class TeamTracker:
         if self.said is not None and i.vehicle is not None:
             (x, y, _), (px, py, _) = i.vehicle.position_world_m, self.said.position_world_m
             self.apart_m = math.hypot(x - px, y - py)
+        bar = i.bar
+        age_s = self._bar_age.update(awake_s, bar.stamp_s if bar is not None and bar.tracking_valid else None)
+        self.bar_unseen_s = self.bar_tilt_deg = 0.0
+        if bar is not None and self.grip is Grip.CARRYING:
+            self.bar_unseen_s = age_s
+            if age_s <= BAR_UNSEEN_S:
+                _, _, up = quat_rotate(bar.attitude_wxyz, (1.0, 0.0, 0.0))
+                self.bar_tilt_deg = math.degrees(math.asin(max(-1.0, min(1.0, abs(up)))))
 
 
 def partner_quiet(t: TeamTracker, timeout_s: float) -> Values | None:
@@ -91,5 +105,19 @@ def bar_force_high(t: TeamTracker, limit_n: float) -> Values | None:
     return (t.force_n, limit_n) if t.force_n > limit_n else None
 
 
+def bar_tilted(t: TeamTracker, _: None) -> Values | None:
+    """Fires if one end of the bar in the air is much higher than the other."""
+    return (t.bar_tilt_deg, BAR_TILT_MAX_DEG) if t.bar_tilt_deg > BAR_TILT_MAX_DEG else None
+
+
+def bar_unseen(t: TeamTracker, _: None) -> Values | None:
+    """Fires if motion capture has lost the bar in the air, whose tilt is then not judged."""
+    return (BAR_UNSEEN_S,) if t.bar_unseen_s > BAR_UNSEEN_S else None
+
+
+BAR_TILT_MAX_DEG: Final = 10.0
+"""Largest tilt of a bar that is carried: 0.2 m between the ends of the shipped one. A lift in a drawn laboratory tilts it by 4 deg."""
+BAR_UNSEEN_S: Final = 0.5
+"""Time after which a bar that motion capture does not see is reported; bodies are hidden for moments."""
 ROTORS_APART_M: Final = 0.05
 """Least distance of the rotor circles in flight."""

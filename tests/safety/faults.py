@@ -12,7 +12,7 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.outputs import ControlLog
-from companion.model.team import Grip
+from companion.model.team import BarPose, Grip
 from companion.model.types import FlightMode, Inputs, OperatorCommand
 from companion.safety.flight_context import FlightContext
 from companion.safety.rule import Rule, Subject
@@ -198,6 +198,22 @@ def heard(**fields: object) -> Change:
     return change
 
 
+def bar(tilt_deg: float, *, seen_ticks: int = 1000) -> Change:
+    """The bar between the two vehicles as motion capture sees it; x points along it. It turns about itself as it likes."""
+    attitude = quat_from_euler_zyx(math.radians(70.0), math.radians(tilt_deg), math.radians(130.0))
+
+    def change(i: Inputs) -> Inputs:
+        pose = BarPose(
+            stamp_s=i.t_s,
+            position_world_m=(0.0, 0.6, 0.9),
+            attitude_wxyz=attitude,
+            tracking_valid=i.tick < seen_ticks,
+        )
+        return replace(i, bar=pose)
+
+    return change
+
+
 def carrying(**changes: object) -> FlightContext:
     return flying(grip=Grip.CARRYING, **changes)
 
@@ -215,6 +231,8 @@ FAULTS: dict[str, Fault] = {
     "partner_let_go": Fault(heard(grip=Grip.FREE), carrying),
     "partner_near": Fault(heard(position_world_m=(0.0, 1.0, 1.0)), carrying),
     "bar_force_high": Fault(context=lambda: carrying(control=control(force_ext_world_n=(0.0, 12.0, 0.0)))),
+    "bar_tilted": Fault(bar(-14.0), carrying),
+    "bar_unseen": Fault(bar(9.0, seen_ticks=3), carrying, sound=0),
     "estimator_silent": Fault(lambda i: replace(i, estimator=fed_by_another(healthy()).estimator)),
     "vision_lost": Fault(estimator(flags=0b1111)),
     "vision_rejected": Fault(estimator(position_horizontal_ratio=1.2)),

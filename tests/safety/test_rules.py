@@ -118,6 +118,8 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "partner_let_go": (None, LAND, 0.115),
     "partner_near": (None, LAND, 0.065),
     "bar_force_high": (None, LAND, 0.300),
+    "bar_tilted": (None, HOLD, 0.220),
+    "bar_unseen": (None, WARN, 0.515),
 }
 """What each rule must request on the ground and in the air (None: it is not reported), and how long after the start of the stream,
 in s, its event must come. Written from the hazards, not from the table of the rules: a change of a row must be made here as well.
@@ -139,7 +141,8 @@ READS = """
     geofence_near 2.29 0.00 1.00; tracking_warn 0.50 0.45; tracking_hold 0.70 0.60; tracking_error 1.20 0.80;
     thrust_saturated 54 1.0; contact_force_high 15.0 12.0; tether_short 0.05 0.10; tether_taut 1.20 0;
     tether_snagged 0 1.20; tether_near 0.00 0.01; tether_wound 1.6 1.5; tether_separated 1.80; partner_quiet 0.3;
-    partner_silent 0.3; partner_near 1.00 1.03; bar_force_high 12.0 10.0
+    partner_silent 0.3; partner_near 1.00 1.03; bar_force_high 12.0 10.0;
+    bar_tilted 14 10; bar_unseen 0.5
 """
 """The numbers that the operator reads in a rule's text, in its units: what was found, then the limit."""
 

@@ -159,3 +159,12 @@ def test_a_member_that_lands_takes_the_other_and_the_bar_with_it() -> None:
     assert_both_down_unharmed(team)
     assert team.scene.bar is not None
     assert team.scene.bar.let_go_m == pytest.approx(0.0, abs=0.03)
+
+
+def test_a_bar_that_tilts_stops_both() -> None:
+    """The right one's battery sags until its rotors carry it no more: before one of the two notices anything else, both hold."""
+    team, result = flown("right.world.faults=[{kind: battery_sag, t_s: 16.0, duration_s: 3.0, size: 4.0}]")
+    for member in result.members:
+        assert ids(member)[2] == "bar_tilted"
+    assert outcomes(result) == [Outcome.ABORTED, Outcome.ABORTED]
+    assert_both_down_unharmed(team)
