@@ -76,4 +76,5 @@ def team_state_of(state: FlightState, i: Inputs) -> TeamState:
         lands=state.aborting and action.rank >= SafetyAction.LAND.rank,
         px4_lands=state.stage is Stage.AUTOPILOT_LAND,
         position_world_m=_NOWHERE if vehicle is None else vehicle.position_world_m,
+        server_s=None if i.mocap is None else i.mocap.exposure_server_s,
     )

@@ -224,7 +224,8 @@ def decoded(datagram: bytes, key: bytes, way: bytes) -> tuple[int, TeamState] | 
         said: TeamState = from_packet(TeamState, text[_HEAD.size :])
     except RecordError:
         return "malformed"
-    if not all(map(math.isfinite, (said.together.go_server_s or 0.0, said.together.plan_s, *said.position_world_m))):
+    times_s = said.together.go_server_s or 0.0, said.together.plan_s, said.server_s or 0.0
+    if not all(map(math.isfinite, (*times_s, *said.position_world_m))):
         return "malformed"
     return int(_HEAD.unpack_from(text)[1]), said
 

@@ -74,6 +74,8 @@ class TeamState(Record, frozen=True, kw_only=True):
     """Whether PX4 lands it."""
     position_world_m: tuple[float, float, float]
     """Position of the body's origin, world frame."""
+    server_s: float | None = None
+    """When it was said, on the clock of the motion-capture server, which both share: exposure of the newest frame; None if unknown."""
 
 
 class PartnerState(Record, frozen=True, kw_only=True):

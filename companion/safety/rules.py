@@ -227,6 +227,11 @@ RULES: tuple[Rule, ...] = (
         message="nothing from the other vehicle for more than {:.1f} s, and both hold the bar",
     ),
     Rule(
+        id="partner_late", subject=Subject.PARTNER, what="what the other vehicle says, which holds the same bar, arrives late",
+        predicate=team.partner_late, thresholds=("partner_timeout_s",), hold_time=0.1, ground=None, air=_LAND,
+        message="what the other vehicle says is {:.1f} s old (limit {:.1f} s), and both hold the bar",
+    ),
+    Rule(
         id=PARTNER_HOLDS, subject=Subject.PARTNER, what="the other vehicle, which carries the same bar, has stopped by itself",
         predicate=team.partner_holds, ground=None, air=_HOLD, message="the other vehicle holds",
     ),

@@ -24,6 +24,8 @@ class TeamTracker:
         self._age = Age()
         self.age_s = math.inf
         """Awake time since the newest announcement arrived."""
+        self.late_s = 0.0
+        """How old the newest announcement was said to be, on the motion-capture server's clock; 0 if that is unknown."""
         self.said: TeamState | None = None
         """The newest announcement."""
         self.grip = Grip.FREE
@@ -45,6 +47,9 @@ class TeamTracker:
         partner = i.partner
         self.said = None if partner is None else partner.said
         self.age_s = self._age.update(awake_s, None if partner is None else partner.stamp_s)
+        self.late_s = 0.0
+        if self.said is not None and self.said.server_s is not None and i.mocap is not None:
+            self.late_s = (i.mocap.exposure_server_s or 0.0) - self.said.server_s
         self.done = self.done or (self.grip in HELD and context.grip not in HELD)
         self.grip = context.grip
         log = context.control
@@ -71,6 +76,11 @@ def partner_quiet(t: TeamTracker, timeout_s: float) -> Values | None:
 def partner_silent(t: TeamTracker, timeout_s: float) -> Values | None:
     """Fires if the other vehicle is silent while this one holds its end of the bar."""
     return (timeout_s,) if t.age_s > timeout_s and t.grip in HELD else None
+
+
+def partner_late(t: TeamTracker, timeout_s: float) -> Values | None:
+    """Fires if what the other vehicle says was said long ago, as on a jammed network, while this one holds its end of the bar."""
+    return (t.late_s, timeout_s) if t.late_s > timeout_s and t.grip in HELD else None
 
 
 def partner_holds(t: TeamTracker, _: None) -> Values | None:

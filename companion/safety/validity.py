@@ -164,10 +164,8 @@ def _bar_is_valid(b: BarPose) -> bool:
 
 
 def _partner_is_valid(p: PartnerState) -> bool:
-    go_s, plan_s = p.said.together.go_server_s, p.said.together.plan_s
-    return (
-        _stamp(p.stamp_s) and (go_s is None or _stamp(go_s)) and _stamp(plan_s) and _in_range3(p.said.position_world_m)
-    )
+    times_s = p.stamp_s, p.said.together.plan_s, p.said.together.go_server_s, p.said.server_s
+    return all(t_s is None or _stamp(t_s) for t_s in times_s) and _in_range3(p.said.position_world_m)
 
 
 def _arm_is_valid(a: ArmState) -> bool:

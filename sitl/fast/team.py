@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -34,16 +35,22 @@ class FastTeam:
     Args:
         config: configuration of both members.
         commands: the operator's commands to each member, by time.
+        link_delay_s: delay of what a member says at a time; infinite for what is lost.
     """
 
-    def __init__(self, config: TeamConfig, commands: Sequence[Mapping[float, OperatorCommand]] = ({}, {})) -> None:
+    def __init__(
+        self,
+        config: TeamConfig,
+        commands: Sequence[Mapping[float, OperatorCommand]] = ({}, {}),
+        link_delay_s: Callable[[float], float] = lambda t_s: LINK_DELAY_S,
+    ) -> None:
         configs = [each for _, each in config.members]
         self.scene = pair_scene(configs)
         self.flights = tuple(
             FastFlight(each, own, scene=self.scene, number=number)
             for number, (each, own) in enumerate(zip(configs, commands, strict=True))
         )
-        self._links = (_Link(), _Link())
+        self._links = (_Link(link_delay_s), _Link(link_delay_s))
         """What each member has sent and the other has not received yet."""
 
     def run(self, limit_s: float = 120.0) -> TeamResult:
@@ -73,8 +80,8 @@ class FastTeam:
 class _Link:
     """One direction of the link between the vehicles."""
 
-    def __init__(self) -> None:
-        self._due_s = 0.0
+    def __init__(self, delay_s: Callable[[float], float]) -> None:
+        self._delay_s, self._due_s = delay_s, 0.0
         self._sent: list[tuple[float, TeamState]] = []
 
     def send(self, t_s: float, said: TeamState | None) -> None:
@@ -82,7 +89,9 @@ class _Link:
         if said is None or t_s < self._due_s:
             return
         self._due_s = t_s + LINK_PERIOD_S - 1e-9
-        self._sent.append((t_s + LINK_DELAY_S, said))
+        arrives_s = t_s + self._delay_s(t_s)
+        if arrives_s < math.inf:
+            self._sent.append((arrives_s, said))
 
     def take(self, t_s: float) -> TeamState | None:
         """Return the newest announcement that has arrived since the last call; None if there is none."""

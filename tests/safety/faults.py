@@ -226,6 +226,7 @@ def unheard(i: Inputs) -> Inputs:
 FAULTS: dict[str, Fault] = {
     "partner_quiet": Fault(unheard),
     "partner_silent": Fault(unheard, carrying),
+    "partner_late": Fault(heard(server_s=START_S - 0.5), carrying, sound=0),
     "partner_holds": Fault(heard(holds=True), carrying),
     "partner_lands": Fault(heard(lands=True), carrying),
     "partner_let_go": Fault(heard(grip=Grip.FREE), carrying),

@@ -113,6 +113,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "tether_separated": (None, LAND, 0.105),
     "partner_quiet": (WARN, WARN, 0.305),  # nothing connects the two yet
     "partner_silent": (None, LAND, 0.305),
+    "partner_late": (None, LAND, 0.105),  # a step of the server's clock is seen by both within a frame
     "partner_holds": (None, HOLD, 0.015),
     "partner_lands": (None, LAND, 0.015),
     "partner_let_go": (None, LAND, 0.115),
@@ -141,7 +142,7 @@ READS = """
     geofence_near 2.29 0.00 1.00; tracking_warn 0.50 0.45; tracking_hold 0.70 0.60; tracking_error 1.20 0.80;
     thrust_saturated 54 1.0; contact_force_high 15.0 12.0; tether_short 0.05 0.10; tether_taut 1.20 0;
     tether_snagged 0 1.20; tether_near 0.00 0.01; tether_wound 1.6 1.5; tether_separated 1.80; partner_quiet 0.3;
-    partner_silent 0.3; partner_near 1.00 1.03; bar_force_high 12.0 10.0;
+    partner_silent 0.3; partner_late 0.6 0.3; partner_near 1.00 1.03; bar_force_high 12.0 10.0;
     bar_tilted 14 10; bar_unseen 0.5
 """
 """The numbers that the operator reads in a rule's text, in its units: what was found, then the limit."""

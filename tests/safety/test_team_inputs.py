@@ -46,6 +46,7 @@ def said(**values: Any) -> dict[str, Any]:
         ("partner", {"stamp_s": math.nan}),
         ("partner", said(position_world_m=(0.0, 0.0, math.inf))),
         ("partner", said(together=Together(go_server_s=math.nan))),
+        ("partner", said(server_s=math.inf)),
     ],
 )
 def test_a_value_that_is_not_valid_makes_the_record_one_that_was_not_received(field: str, values: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
 
 import pytest
@@ -168,3 +169,18 @@ def test_a_bar_that_tilts_stops_both() -> None:
         assert ids(member)[2] == "bar_tilted"
     assert outcomes(result) == [Outcome.ABORTED, Outcome.ABORTED]
     assert_both_down_unharmed(team)
+
+
+@pytest.mark.parametrize(("rate", "event"), [(0.5, "partner_late"), (math.inf, "partner_silent")], ids=["late", "lost"])
+def test_a_link_that_is_late_or_lost_lands_both(rate: float, event: str) -> None:
+    """Announcements that wait longer and longer on the network keep arriving: only the clock that both share shows how old they are."""
+    config = load_team("carry", SHORT, world=IDEAL)
+    team = FastTeam(config, link_delay_s=lambda t_s: 0.002 if t_s <= 17.5 else rate * (t_s - 17.5))
+    result = team.run()
+    for member in result.members:
+        assert ids(member)[2] == event
+    assert outcomes(result) == [Outcome.ABORTED, Outcome.ABORTED]
+    assert_both_down_unharmed(team)
+    assert team.scene.bar is not None
+    assert team.scene.bar.let_go_m is not None
+    assert team.scene.bar.let_go_m < 0.1, "the height up to which the mission lets it be let go"
