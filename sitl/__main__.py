@@ -74,26 +74,28 @@ class _Member:
     channel: tuple[int, int]
     """Descriptors from which it reads what the launcher says, and to which it writes."""
     time: MachineTime | None
+    px4_folder: Path | None
+    """Folder of its real PX4; None for the stub."""
 
     def send(self, message: WorldMessage) -> None:
         """Send a message to the launcher."""
         _send(message, self.channel[1])
 
-    def machine(self, for_launcher: bool, px4_folder: Path | None) -> MachineWires:
+    def machine(self, for_launcher: bool) -> MachineWires:
         """Return the machine, whose links are not open yet."""
         config, start = self.config, self.config.mission.start
         on_message = self.send if for_launcher else _print_message
         px4 = None
-        if px4_folder is not None:
+        if self.px4_folder is not None:
             airframe = config.vehicle.airframe
-            px4 = RealPx4(airframe, config.world, px4_folder, lambda text: on_message(WorldProgress(text)))
+            px4 = RealPx4(airframe, config.world, self.px4_folder, lambda text: on_message(WorldProgress(text)))
         pose = start_of(start.position_m, start.yaw_deg, start.arm_deg)
         ports = Ports() if for_launcher else _STANDARD
         return MachineWires(config.vehicle, config.world, pose, ports, on_message, px4, self.time)
 
 
-async def _serve(members: Sequence[_Member], for_launcher: bool, px4_folder: Path | None, speed: float) -> None:
-    machines = [member.machine(for_launcher, px4_folder) for member in members]
+async def _serve(members: Sequence[_Member], for_launcher: bool, speed: float) -> None:
+    machines = [member.machine(for_launcher) for member in members]
     times = [member.time for member in members if member.time is not None]
     keeper = TimeKeeper(times, speed) if times else None
     make_scene = None if len(members) == 1 else partial(pair_scene, [member.config for member in members])
@@ -210,7 +212,11 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--for-launcher", action="store_true")
     parser.add_argument(
-        "--px4", type=Path, metavar="DIR", help="fly a real PX4; this folder keeps its parameters and logs"
+        "--px4",
+        type=Path,
+        action="append",
+        metavar="DIR",
+        help="fly a real PX4; this folder keeps its parameters and logs; repeated for each --config",
     )
     parser.add_argument(
         "--channel",
@@ -232,10 +238,11 @@ def main(argv: list[str] | None = None) -> int:
     channels = [(0, 1), *(_numbers(text) for text in arguments.channel)]
     members: list[_Member] = []
     try:
-        for path, channel, time in zip(arguments.config, channels, times, strict=True):
-            config = SitlConfig.model_validate_json(path.read_text(encoding="utf-8"))
-            members.append(_Member(with_fault_times(with_throws(config)), path.parent, (channel[0], channel[1]), time))
-        served = _serve(members, arguments.for_launcher, arguments.px4, arguments.speed)
+        px4 = arguments.px4 or [None] * len(channels)
+        for path, channel, time, folder in zip(arguments.config, channels, times, px4, strict=True):
+            config = with_fault_times(with_throws(SitlConfig.model_validate_json(path.read_text(encoding="utf-8"))))
+            members.append(_Member(config, path.parent, (channel[0], channel[1]), time, folder))
+        served = _serve(members, arguments.for_launcher, arguments.speed)
         with asyncio.Runner(loop_factory=LockstepLoop if arguments.time else fine_loop) as runner:
             runner.run(served)
     except (OSError, LinkError, FaultError, Px4Error) as error:

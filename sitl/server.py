@@ -176,8 +176,7 @@ class Sitl:
             raise errors.exceptions[0] from None
 
     async def _prepare(self, on_ready: Callable[[], None]) -> None:
-        for machine in self.machines:
-            await machine.autopilot.prepare()
+        await asyncio.gather(*(machine.autopilot.prepare() for machine in self.machines))
         on_ready()
 
     @property

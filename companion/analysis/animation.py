@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,12 @@ from companion.model.types import PhaseKind, Vec3
 WIDTH, HEIGHT = 960, 440
 FRAMES_PER_S = 12.5
 """Frame rate; its period is a multiple of 0.01 s, because a GIF stores the delay of a frame in hundredths of a second."""
-_SPLIT_PX = 600
+SPLIT_PX = 600
 """Column that separates the scene (left) from the plots (right)."""
 _PLOT_X = (650.0, 946.0)
 _PLOTS_Y = ((50.0, 205.0), (262.0, 405.0))
 _SOFT, _AXIS, _GRID = "#5b6b79", "#aab4bd", "#e6eaee"
-_FLYING = (PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING)
+FLYING = (PhaseKind.TAKEOFF, PhaseKind.FLIGHT, PhaseKind.LANDING)
 _GRAVITY_WORLD_M_S2 = np.array([0.0, 0.0, -GRAVITY_M_S2])
 _TARGET_M = np.array([0.1, 0.0, -0.16])
 """Point that the camera looks at, relative to the vehicle, world axes."""
@@ -69,7 +69,7 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
     Args:
         summary: summary of the flight, with the payload's mass and the simulated world.
     """
-    flying = np.flatnonzero([o.phase_kind in _FLYING for o in log.outputs])
+    flying = np.flatnonzero([o.phase_kind in FLYING for o in log.outputs])
     moving = (log.columns.mocap_position_world_m, log.columns.arm_rad)
     if len(flying) < 2 or not all(np.isfinite(rows).all(axis=1).any() for rows in moving):
         return None
@@ -84,7 +84,7 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
     if caught is not None and caught >= last:
         caught = None
     start_s, t_s = log.outputs[first].mission_t_s - log.columns.t_s[first], log.columns.t_s
-    track = _Track(log, scene, caught, _throw_velocity_m_s(log, summary))
+    track = Track(log, scene, caught, _throw_velocity_m_s(log, summary))
     axes, curves = _plots(log, t_s + start_s, slice(first, last + 1), caught)
     frames: list[Frame] = []
     still, target = 0, None
@@ -97,9 +97,9 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
         pose = track.pose(k)
         centre = np.array(pose.position_world_m) + _TARGET_M
         target = centre if target is None else target + 0.25 * (centre - target)
-        camera = Camera(target, math.radians(68.0), math.radians(11.0), 4.0, (_SPLIT_PX, HEIGHT))
+        camera = Camera(target, math.radians(68.0), math.radians(11.0), 4.0, (SPLIT_PX, HEIGHT))
         shapes = scene.shapes(camera, pose)
-        shapes += _labels(log, k, t_s[k] + start_s, speed)
+        shapes += labels(log.outputs[k].phase, t_s[k] + start_s, speed)
         if pose.ball_world_m:
             x, y = camera.pixels(np.array(pose.ball_world_m[:1]))[0]
             shapes.append(Shape(np.array([[min(x + 64.0, 485.0), y - 32.0]]), CATCH, 17.0, text=f"{name}, thrown"))
@@ -108,8 +108,7 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
             shapes.append(Shape(net + np.array([0.0, 56.0]), CATCH, 17.0, text=f"{name}, caught"))
         if moment is not None and k <= moment:
             still = len(frames)
-        x = _PLOT_X[0] + (t_s[k] - t_s[first]) / (t_s[last] - t_s[first]) * (_PLOT_X[1] - _PLOT_X[0])
-        frames.append(Frame(shapes, float(x)))
+        frames.append(Frame(shapes, float(plot_x((t_s[first], t_s[last]), t_s[k]))))
     return Movie(axes, curves, frames, max(still - 4, 0))
 
 
@@ -139,7 +138,7 @@ def _times(first_s: float, last_s: float, moment_s: float | None) -> Iterator[tu
             now_s += speed / FRAMES_PER_S
 
 
-class _Track:
+class Track:
     """Poses of vehicle, arm and payload; the previous measurement replaces a missing one."""
 
     def __init__(self, log: FlightLog, scene: Scene, caught: int | None, throw_velocity_m_s: Array | None) -> None:
@@ -204,13 +203,14 @@ def _throw_velocity_m_s(log: FlightLog, summary: dict[str, Any]) -> Array | None
     return None if velocity is None else np.array(velocity, dtype=np.float64)
 
 
-def _labels(log: FlightLog, k: int, mission_s: float, speed: float) -> list[Shape]:
+def labels(phase: str, mission_s: float, speed: float) -> list[Shape]:
+    """Return what stands above the scene."""
     at = np.array([[16.0, 24.0]])
     pace = "¼ speed" if speed < 1 else f"{speed:.{1 if speed < 1.95 else 0}f}× speed"
     if abs(speed - 1) < 0.05:
         pace = "real time"
     return [
-        Shape(at, INK, 18.0, text=log.outputs[k].phase, align="left"),
+        Shape(at, INK, 18.0, text=phase, align="left"),
         Shape(at + np.array([0.0, 24.0]), _SOFT, 14.0, text=f"t = {mission_s:.2f} s", align="left"),
         Shape(at + np.array([100.0, 24.0]), CATCH if speed < 1 else _SOFT, 14.0, text=pace, align="left"),
     ]
@@ -220,16 +220,33 @@ def _plots(log: FlightLog, mission_s: Array, ticks: slice, caught: int | None) -
     """Return the axes and the curves of position error and arm error, or attitude error without an arm."""
     scaled = np.array([o.phase_kind in (PhaseKind.TAKEOFF, PhaseKind.FLIGHT) for o in log.outputs])
     arm = np.degrees(np.linalg.norm(metrics.arm_error_rad(log), axis=1))
-    axes: list[Shape] = [Shape(np.array([[_SPLIT_PX, 0.0], [_SPLIT_PX, HEIGHT]]), _GRID, 1.0)]
-    curves: list[Shape] = []
     t_s = mission_s[ticks]
     attitude = np.degrees(np.linalg.norm(metrics.attitude_error_rad(log), axis=1))
     position_cm = 100.0 * np.linalg.norm(metrics.position_error_m(log), axis=1)
-    below = ("arm error [deg]", arm, LINK) if log.joint_count else ("attitude error [deg]", attitude, LINK)
-    for (top, bottom), name, values, colour in (
-        (_PLOTS_Y[0], "position error [cm]", position_cm, FRONT),
-        (_PLOTS_Y[1], *below),
-    ):
+    below = ("arm error [deg]", arm) if log.joint_count else ("attitude error [deg]", attitude)
+    rows = [(name, values[ticks]) for name, values in (("position error [cm]", position_cm), below)]
+    axes, curves = plotted((t_s[0], t_s[-1]), t_s, rows, scaled[ticks])
+    if caught is not None:
+        x = float(plot_x((t_s[0], t_s[-1]), mission_s[caught]))
+        axes += [Shape(np.array([[x, top], [x, bottom]]), CATCH, 1.0, 0.6) for top, bottom in _PLOTS_Y]
+        axes.append(Shape(np.array([[x + 5, _PLOTS_Y[0][0] + 7]]), CATCH, 12.0, text="catch", align="left"))
+    return axes, curves
+
+
+def plotted(
+    span_s: tuple[float, float], t_s: Array, rows: Sequence[tuple[str, Array]], scaled: npt.NDArray[np.bool_]
+) -> tuple[list[Shape], list[Shape]]:
+    """Return the axes and the curves of two plots, one below the other.
+
+    Args:
+        span_s: start and end of the time axis.
+        t_s: time of each value.
+        rows: name of each plot, and its values.
+        scaled: which of the values the scale must hold.
+    """
+    axes: list[Shape] = [Shape(np.array([[SPLIT_PX, 0.0], [SPLIT_PX, HEIGHT]]), _GRID, 1.0)]
+    curves: list[Shape] = []
+    for (top, bottom), colour, (name, values) in zip(_PLOTS_Y, (FRONT, LINK), rows, strict=True):
         seen = values[scaled & np.isfinite(values)]
         limit = _round_up(1.1 * float(seen.max())) if len(seen) else 1.0
         axes.append(Shape(np.array([[_PLOT_X[0] - 34, top - 22]]), INK, 14.0, text=name, align="left"))
@@ -237,21 +254,22 @@ def _plots(log: FlightLog, mission_s: Array, ticks: slice, caught: int | None) -
             y = bottom + share * (top - bottom)
             axes.append(Shape(np.array([[_PLOT_X[0], y], [_PLOT_X[1], y]]), _GRID if share else _AXIS, 1.0))
             axes.append(Shape(np.array([[_PLOT_X[0] - 7, y]]), _SOFT, 12.0, text=f"{share * limit:g}", align="right"))
-        curves.append(Shape(_curve(t_s, values[ticks] / limit, top, bottom), colour, 2.0))
+        curves.append(Shape(_curve(span_s, t_s, values / limit, top, bottom), colour, 2.0))
     for share in (0.0, 0.5, 1.0):
         at = np.array([[_PLOT_X[0] + share * (_PLOT_X[1] - _PLOT_X[0]), _PLOTS_Y[1][1] + 15]])
-        text = f"{t_s[0] + share * (t_s[-1] - t_s[0]):.0f} s"
+        text = f"{span_s[0] + share * (span_s[1] - span_s[0]):.0f} s"
         axes.append(Shape(at, _SOFT, 12.0, text=text, align=("left", "center", "right")[round(2 * share)]))
-    if caught is not None:
-        x = _PLOT_X[0] + (mission_s[caught] - t_s[0]) / (t_s[-1] - t_s[0]) * (_PLOT_X[1] - _PLOT_X[0])
-        axes += [Shape(np.array([[x, top], [x, bottom]]), CATCH, 1.0, 0.6) for top, bottom in _PLOTS_Y]
-        axes.append(Shape(np.array([[x + 5, _PLOTS_Y[0][0] + 7]]), CATCH, 12.0, text="catch", align="left"))
     return axes, curves
 
 
-def _curve(t_s: Array, share: Array, top: float, bottom: float) -> Array:
+def plot_x(span_s: tuple[float, float], t_s: Any) -> Any:
+    """Return the pixel column of a time, or of each of an array of times."""
+    return _PLOT_X[0] + (t_s - span_s[0]) / (span_s[1] - span_s[0]) * (_PLOT_X[1] - _PLOT_X[0])
+
+
+def _curve(span_s: tuple[float, float], t_s: Array, share: Array, top: float, bottom: float) -> Array:
     """Return a curve with the largest value of each pixel column; values above the axis, as at touchdown, are drawn at its top."""
-    x = _PLOT_X[0] + (t_s - t_s[0]) / (t_s[-1] - t_s[0]) * (_PLOT_X[1] - _PLOT_X[0])
+    x = plot_x(span_s, t_s)
     starts = np.flatnonzero(np.diff(np.floor(x), prepend=-1.0))
     largest = np.fmax.reduceat(share, starts)
     points = np.column_stack([x[starts], bottom + np.minimum(largest, 1.0) * (top - bottom)])
@@ -282,7 +300,7 @@ def player_html(movie: Movie) -> str:
         "curves": [packed(shape) for shape in movie.curves],
         "frames": [[round(frame.curves_to_px, 1), *map(packed, frame.shapes)] for frame in movie.frames],
     }
-    data |= {"width": WIDTH, "height": HEIGHT, "split": _SPLIT_PX, "frames_per_s": FRAMES_PER_S, "still": movie.still}
+    data |= {"width": WIDTH, "height": HEIGHT, "split": SPLIT_PX, "frames_per_s": FRAMES_PER_S, "still": movie.still}
     text = json.dumps(data | {"styles": list(styles)}, separators=(",", ":"), ensure_ascii=False).replace("</", "<\\/")
     script = Path(__file__).with_name("player.js").read_text(encoding="utf-8")
     return (
@@ -317,7 +335,7 @@ def write_gif(movie: Movie, path: Path, width_px: int = 800) -> None:
             for x, y in (points[0], points[-1]):
                 pen.ellipse((x - width / 2, y - width / 2, x + width / 2, y + width / 2), fill)
 
-    right = Shape(np.array([[_SPLIT_PX, 0], [WIDTH, 0], [WIDTH, HEIGHT], [_SPLIT_PX, HEIGHT]]), "#ffffff")
+    right = Shape(np.array([[SPLIT_PX, 0], [WIDTH, 0], [WIDTH, HEIGHT], [SPLIT_PX, HEIGHT]]), "#ffffff")
     pictures = []
     for frame in movie.frames:
         picture = Image.new("RGB", size, "white")

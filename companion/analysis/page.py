@@ -59,6 +59,8 @@ class Page:
     """The outcome, beside the title."""
     player_html: str = ""
     """HTML element that plays an animation of the flight; inserted unchanged."""
+    links: Sequence[tuple[str, str]] = ()
+    """Text and relative address of the pages to which this one leads."""
     width_rem: int = 86
     """Maximum width of the text, rem."""
 

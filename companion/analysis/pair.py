@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from statistics import median
 from typing import Any
 
@@ -41,6 +41,25 @@ class BarTruth(Record, frozen=True):
     """Largest height above its stand from which the bar has fallen or was let go; None if it was never let go."""
 
 
+def bar_errors(at: Vec3, attitude: Quat, pulls_world_n: Sequence[Vec3], planned_m: Vec3) -> tuple[float, float, float]:
+    """Return the distance of the bar from its planned place in m, its tilt in rad (positive with the left end up), and the force in N
+    that stretches it.
+
+    Args:
+        at: true centre, world frame.
+        attitude: true attitude; x points to the left end.
+        pulls_world_n: force of each clamp on its handle, the left one first.
+        planned_m: planned centre, world frame.
+    """
+    along = quat_rotate(attitude, (1.0, 0.0, 0.0))
+    # The force that stretches the bar: half the difference of what its ends are pulled with, outwards.
+    internal_n = 0.5 * sum(
+        sign * sum(a * b for a, b in zip(pull, along, strict=True))
+        for sign, pull in zip((1, -1), pulls_world_n, strict=True)
+    )
+    return math.dist(at, planned_m), math.asin(max(-1.0, min(1.0, along[2]))), internal_n
+
+
 class PairFigures:
     """Collects the errors of the bar at the times at which both vehicles carry it."""
 
@@ -52,22 +71,8 @@ class PairFigures:
         """Sums of what each vehicle lifts."""
 
     def add(self, at: Vec3, attitude: Quat, pulls_world_n: Sequence[Vec3], planned_m: Vec3) -> None:
-        """Add the state of the bar at one time.
-
-        Args:
-            at: true centre, world frame.
-            attitude: true attitude; x points to the left end.
-            pulls_world_n: force of each clamp on its handle, the left one first.
-            planned_m: planned centre, world frame.
-        """
-        along = quat_rotate(attitude, (1.0, 0.0, 0.0))
-        # The force that stretches the bar: half the difference of what its ends are pulled with, outwards.
-        internal = 0.5 * sum(
-            sign * sum(a * b for a, b in zip(pull, along, strict=True))
-            for sign, pull in zip((1, -1), pulls_world_n, strict=True)
-        )
-        tilt_rad = math.asin(max(-1.0, min(1.0, along[2])))
-        for n, value in enumerate((math.dist(at, planned_m), tilt_rad, internal)):
+        """Add the state of the bar at one time; arguments as for `bar_errors`."""
+        for n, value in enumerate(bar_errors(at, attitude, pulls_world_n, planned_m)):
             self._squares[n] += value * value
         for machine, pull in enumerate(pulls_world_n):
             self._lifts[machine] += pull[2]
@@ -103,27 +108,34 @@ def figures_of(truth: BarTruth | None, left: FlightLog | None, right: FlightLog 
     """
     figures = PairFigures()
     if truth is not None and left is not None and right is not None:
-        sides = [_Course(log, truth) for log in (left, right)]
-        for sample in truth.samples:
-            ours, theirs = (side.at(sample.t_s) for side in sides)
-            carry = None if ours is None else ours.carry
-            if sample.gripped and carry and ours and theirs and carries(ours) and carries(theirs):
-                pose = sample.position_world_m, sample.attitude_wxyz
-                figures.add(*pose, sample.pulls_world_n, carry.centre_world_m)
+        for sample, planned_m in carried(truth, Course(left, truth), Course(right, truth)):
+            figures.add(sample.position_world_m, sample.attitude_wxyz, sample.pulls_world_n, planned_m)
     return figures.report(None if truth is None else truth.let_go_m)
 
 
-class _Course:
-    """The outputs of a log by the time of the world."""
+class Course:
+    """A log by the time of the world."""
 
     def __init__(self, log: FlightLog, truth: BarTruth) -> None:
         offset_s = 0.0 if log.clock == "simulated" else _offset_s(log, truth)
-        self._outputs = log.outputs
-        self._times_s = [inputs.t_s - offset_s for inputs in log.inputs]
+        self.log = log
+        self.times_s = [inputs.t_s - offset_s for inputs in log.inputs]
 
-    def at(self, t_s: float) -> Outputs | None:
-        index = bisect.bisect_right(self._times_s, t_s + 1e-6) - 1
-        return None if index < 0 or t_s - self._times_s[index] > _NEAR_S else self._outputs[index]
+    def index(self, t_s: float) -> int | None:
+        """Return the index in the log of the tick before a time of the world; None where the log has none near it."""
+        index = bisect.bisect_right(self.times_s, t_s + 1e-6) - 1
+        return None if index < 0 or t_s - self.times_s[index] > _NEAR_S else index
+
+
+def carried(truth: BarTruth, left: Course, right: Course) -> Iterator[tuple[BarSample, Vec3]]:
+    """Yield the true states of the bar at the times at which both vehicles carry it, each with its planned centre, world frame."""
+    for sample in truth.samples:
+        ours, theirs = left.index(sample.t_s), right.index(sample.t_s)
+        if not sample.gripped or ours is None or theirs is None:
+            continue
+        outputs = left.log.outputs[ours]
+        if outputs.carry is not None and carries(outputs) and carries(right.log.outputs[theirs]):
+            yield sample, outputs.carry.centre_world_m
 
 
 def _offset_s(log: FlightLog, truth: BarTruth) -> float:

@@ -14,7 +14,7 @@ from companion.analysis.log import FlightLog
 from companion.analysis.page import Page, Section, write_page
 from companion.analysis.plots import write_plots
 from companion.analysis.summary import effective_config, world_text
-from companion.analysis.table import Cell, Column, Table, table
+from companion.analysis.table import Cell, Column, Table, pairs, table
 from companion.model.types import Outcome, SafetyAction
 
 
@@ -48,7 +48,7 @@ def write_report(log: FlightLog, summary: dict[str, Any], out_dir: Path) -> Path
             Section("", cards=_results(summary, log.stride, catches)),
             *([Section("Plots", pictures=plots)] if plots else []),
             Section("Events", "" if summary["events"] else "None.", [_events(summary["events"])]),
-            Section("Record", tables=[_pairs("", versions)], folded=folded),
+            Section("Record", tables=[pairs("", versions)], folded=folded),
         ],
         verdict=_why_ended(summary),
         good=False,
@@ -126,11 +126,11 @@ def _results(summary: dict[str, Any], stride: int, catches: bool) -> list[Table]
     if recorder.get("error"):
         processes.append(("recorder", recorder["error"]))
     return [
-        _pairs("RMS error", rms, *parts.values()),
-        _pairs("Flight", flight),
+        pairs("RMS error", rms, *parts.values()),
+        pairs("Flight", flight),
         *_contact(summary),
-        *([] if clock["kind"] == "simulated" else [_pairs("Timing [ms]", timing, "p50", "p99", "max")]),
-        _pairs("Loop and log", processes),
+        *([] if clock["kind"] == "simulated" else [pairs("Timing [ms]", timing, "p50", "p99", "max")]),
+        pairs("Loop and log", processes),
     ]
 
 
@@ -158,16 +158,11 @@ def _contact(summary: dict[str, Any]) -> list[Table]:
             rows.append(("found surface off (simulation)", f"{1e3 * off[0]:.1f} mm, {off[1]:.1f} deg"))
     if (distance_m := rotor_distance_m(summary)) is not None:
         rows.append(("nearest rotor (simulation)", f"{distance_m:.2f} m"))
-    return [_pairs("Contact", rows)]
+    return [pairs("Contact", rows)]
 
 
 def _vector(values: Sequence[float]) -> str:
     return ", ".join(f"{value:z.3f}" for value in values)
-
-
-def _pairs(title: str, rows: Sequence[tuple[str, ...]], *heads: str) -> Table:
-    columns = [Column(head, lambda row, k=k: row[k], left=k == 0) for k, head in enumerate(("", *(heads or ("",))))]  # type: ignore[misc]
-    return table(columns, rows, title=title)
 
 
 def _events(events: Sequence[dict[str, Any]]) -> Table:

@@ -62,20 +62,29 @@ class Pose:
 class Camera:
     """Pinhole camera that looks at a point."""
 
-    def __init__(self, target_m: Array, yaw_rad: float, pitch_rad: float, distance_m: float, size_px: Vec2) -> None:
+    def __init__(
+        self,
+        target_m: Array,
+        yaw_rad: float,
+        pitch_rad: float,
+        distance_m: float,
+        size_px: Vec2,
+        view_m: float = VIEW_M,
+    ) -> None:
         """Place the camera.
 
         Args:
             target_m: world point in the middle of the frame.
             yaw_rad: horizontal direction of view, measured from world x.
             pitch_rad: angle of the view below the horizon.
-            size_px: width and height of the frame; its height covers `VIEW_M` at the target.
+            size_px: width and height of the frame.
+            view_m: what its height covers at the target.
         """
         cy, sy, cp, sp = math.cos(yaw_rad), math.sin(yaw_rad), math.cos(pitch_rad), math.sin(pitch_rad)
         self._axes = np.array([[sy, -cy, 0.0], [-sp * cy, -sp * sy, -cp], [cp * cy, cp * sy, -sp]])
         self._eye = target_m - distance_m * self._axes[2]
         self._middle = np.array(size_px) / 2
-        self._focal_px = size_px[1] * distance_m / VIEW_M
+        self._focal_px = size_px[1] * distance_m / view_m
 
     def depth_m(self, point: Array) -> float:
         """Return the distance of a point from the eye along the direction of view."""
@@ -130,9 +139,9 @@ class Scene:
         """Return the centre of the net, world frame, m."""
         return self._world(pose, self._arm_body_m(pose.arm_rad)[-1])
 
-    def shapes(self, camera: Camera, pose: Pose) -> list[Shape]:
-        """Return the shapes of one frame, the farthest first."""
-        shapes = self._room(camera)
+    def shapes(self, camera: Camera, pose: Pose, *, room: bool = True) -> list[Shape]:
+        """Return the shapes of one frame, the farthest first, with or without the room."""
+        shapes = self._room(camera) if room else []
         centre = np.array(pose.position_world_m)
         shapes.append(self._shadow(camera, centre, 0.8 * (self._hub_m + self._disk_m), 0.16))
         parts = self._machine(camera, pose)

@@ -131,3 +131,9 @@ def for_terminal(shown: Table) -> TerminalTable:
 def _markup(cell: Cell) -> str:
     parts = ((cell.text, STYLES.get(cell.kind)), (cell.note, STYLES.get(cell.note_kind)))
     return "\n".join(f"[{style}]{escape(text)}[/]" if style else escape(text) for text, style in parts if text)
+
+
+def pairs(title: str, rows: Sequence[tuple[str, ...]], *heads: str) -> Table:
+    """Return a table of names and values; `heads` are the titles of the columns of values."""
+    columns = [Column(head, lambda row, k=k: row[k], left=k == 0) for k, head in enumerate(("", *(heads or ("",))))]  # type: ignore[misc]
+    return table(columns, rows, title=title)

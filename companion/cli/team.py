@@ -47,7 +47,9 @@ def add_parser(commands: Any) -> None:
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("team", metavar="TEAM", help=f"team: a built-in name ({', '.join(names('teams'))}) or a file")
-    parser.add_argument("--sitl", metavar="stub", help="in the simulated world, with two PX4 stubs")
+    parser.add_argument(
+        "--sitl", metavar="stub|px4", help="in the simulated world, with two PX4 stubs or two real PX4 (SITL)"
+    )
     add_law(parser)
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="of both members"
@@ -67,16 +69,15 @@ def _loaded(arguments: argparse.Namespace) -> TeamConfig:
     Raises:
         ConfigError: the files have problems, the members do not go together, or one cannot fly its part.
     """
-    if arguments.sitl not in (None, "stub"):
-        raise ConfigError(
-            [f"companion team: --sitl={arguments.sitl}: expected --sitl, because a team flies with two PX4 stubs"]
-        )
+    if arguments.sitl not in (None, "stub", "px4"):
+        raise ConfigError([f"companion team: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4"])
     team = load_team(
         arguments.team,
         arguments.overrides,
         controller_law=arguments.controller,
         preset=arguments.preset,
         world=arguments.world,
+        real_px4=arguments.sitl == "px4",
     )
     problems = []
     for end, config in team.members:
@@ -105,7 +106,8 @@ def _fly(arguments: argparse.Namespace) -> int:
     if problem is not None:
         print_error(f"companion team fly: --out {out}: {problem}")
         return EXIT_BAD_INPUT
-    return run_team(team, out, console=terminal_console(), report=not arguments.no_report, speed=speed)
+    console, px4 = terminal_console(), arguments.sitl == "px4"
+    return run_team(team, out, console=console, report=not arguments.no_report, speed=speed, px4=px4)
 
 
 def _check(arguments: argparse.Namespace) -> int:
@@ -123,7 +125,8 @@ def _check(arguments: argparse.Namespace) -> int:
         members = linked(team, scratch)
         for end in members:
             (scratch / end).mkdir()
-        worlds = SitlProcess.start_all([(config, scratch / end) for end, config in members.items()])
+        folders = [(config, scratch / end) for end, config in members.items()]
+        worlds = SitlProcess.start_all(folders, px4=arguments.sitl == "px4")
         try:
             arguments.plan_only = False
             for (end, config), world in zip(members.items(), worlds, strict=True):

@@ -87,6 +87,7 @@ class SitlProcess:
             path = out / "sitl_config.json"
             write_text(path, config.model_dump_json(indent=1))
             arguments += ["--config", str(path)]
+            arguments += ["--px4", str((out / PX4_FOLDER).resolve())] if px4 else []
         pipes = [(*os.pipe(), *os.pipe()) for _ in members]
         for hears, _, _, speaks in pipes[1:]:
             arguments += ["--channel", f"{hears},{speaks}"]
@@ -97,7 +98,6 @@ class SitlProcess:
                 arguments += in_time
                 inherited += descriptors
         out = members[0][1]
-        arguments += ["--px4", str((out / PX4_FOLDER).resolve())] if px4 else []
         with open(out / "sitl.log", "wb") as log:
             process = subprocess.Popen(
                 arguments,

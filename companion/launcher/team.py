@@ -17,7 +17,7 @@ from rich.console import Console
 from companion.analysis.log import FlightLog
 from companion.analysis.pair import BarTruth, figures_of
 from companion.analysis.summary import write_summary
-from companion.launcher.launcher import FlightResult, Launcher
+from companion.launcher.launcher import FlightResult, Launcher, Sitl
 from companion.launcher.reports import LAND_SIGNALS
 from companion.launcher.run import report_of, summary_of
 from companion.launcher.sitl_process import SitlProcess
@@ -114,7 +114,15 @@ class TeamLauncher:
         return wait
 
 
-def run_team(team: TeamConfig, out: Path, *, console: Console, report: bool = True, speed: float | None = None) -> int:
+def run_team(
+    team: TeamConfig,
+    out: Path,
+    *,
+    console: Console,
+    report: bool = True,
+    speed: float | None = None,
+    px4: bool = False,
+) -> int:
     """Fly a team in the simulated world, write the summaries and, if requested, the reports; return the exit code.
 
     Args:
@@ -123,13 +131,14 @@ def run_team(team: TeamConfig, out: Path, *, console: Console, report: bool = Tr
         console: where to print.
         report: whether to write the report of each member.
         speed: simulated seconds in a second of real time at most; None for a flight in real time.
+        px4: whether two real PX4 fly in place of two stubs.
     """
     try:
         members = linked(team, out)
         folders = {end: out / end for end in members}
         for folder in folders.values():
             folder.mkdir(exist_ok=True)
-        worlds = SitlProcess.start_all([(config, folders[end]) for end, config in members.items()], speed)
+        worlds = SitlProcess.start_all([(config, folders[end]) for end, config in members.items()], speed, px4=px4)
     except (OSError, LaunchError) as error:
         print_error(f"companion team fly: {error}")
         return EXIT_CODES[Outcome.REFUSED]
@@ -138,7 +147,8 @@ def run_team(team: TeamConfig, out: Path, *, console: Console, report: bool = Tr
     for (end, config), world in zip(members.items(), worlds, strict=True):
         display = FlightDisplay(prefixed_console(f"{end:<6}"), "")
         shown, folder = display.on_message, folders[end]
-        launchers.append(Launcher(config, folder, sitl="stub", on_message=shown, speed=speed, world=world))
+        sitl: Sitl = "px4" if px4 else "stub"
+        launchers.append(Launcher(config, folder, sitl=sitl, on_message=shown, speed=speed, world=world))
     launcher = TeamLauncher(worlds, launchers)
     with signals_call(LAND_SIGNALS, launcher.request_landing):
         results = dict(zip(members, launcher.run(), strict=True))
@@ -147,14 +157,14 @@ def run_team(team: TeamConfig, out: Path, *, console: Console, report: bool = Tr
                 print_error(f"{end}: {line}")
         outcome = max((result.outcome for result in results.values()), key=_WORSE.index)
         try:
-            summary, logs = _summaries(members, results, folders, speed)
-            write_summary({"name": team.name, "outcome": outcome.value, **summary}, out / "summary.json")
+            found, logs, truth = _summaries(members, results, folders, speed)
+            summary = {"name": team.name, "outcome": outcome.value, **found}
+            write_summary(summary, out / "summary.json")
         except OSError as error:
             print_error(f"{out}: summary.json cannot be written: {error.strerror}")
             return EXIT_CODES[outcome]
-    if report:
-        _write_reports(console, logs, summary["members"], folders)
-    print_team_result(console, outcome.value, summary, out)
+    path = _write_reports(console, logs, truth, summary, out) if report else None
+    print_team_result(console, summary, path or out)
     return EXIT_CODES[outcome]
 
 
@@ -163,29 +173,38 @@ def _summaries(
     results: Mapping[End, FlightResult],
     folders: Mapping[End, Path],
     speed: float | None,
-) -> tuple[dict[str, Any], dict[End, FlightLog | None]]:
-    """Write summary.json of each member; return the summary of both and the logs."""
+) -> tuple[dict[str, Any], dict[End, FlightLog | None], BarTruth | None]:
+    """Write summary.json of each member; return the summary of both, the logs and the true course of the bar."""
     logs, summaries = {}, {}
     for end, config in members.items():
         logs[end], summaries[end] = summary_of(config, results[end], folders[end], speed)
     truth = None
     with contextlib.suppress(OSError, ValueError, RecordError):  # a world that was killed has written none
         truth = from_jsonable(BarTruth, json.loads((folders["left"] / BAR_FILE).read_text(encoding="utf-8")))
-    return {"team": figures_of(truth, logs["left"], logs["right"]), "members": summaries}, logs
+    return {"team": figures_of(truth, logs["left"], logs["right"]), "members": summaries}, logs, truth
 
 
 def _write_reports(
     console: Console,
     logs: Mapping[End, FlightLog | None],
-    summaries: Mapping[End, dict[str, Any]],
-    folders: Mapping[End, Path],
-) -> None:
+    truth: BarTruth | None,
+    summary: Mapping[str, Any],
+    out: Path,
+) -> Path | None:
+    """Write the report of each member and that of both; return the path of the latter, None if there is none."""
     try:
         with console.status("writing the reports"):
             for end, log in logs.items():
                 if log is not None:
-                    report_of(log, summaries[end], folders[end])
+                    report_of(log, summary["members"][end], out / end)
+            left, right = logs["left"], logs["right"]
+            if left is not None and right is not None and truth is not None:
+                with contextlib.suppress(ImportError):  # a flight does not need matplotlib
+                    from companion.analysis.pair_report import write_pair_report
+
+                    return write_pair_report(summary, truth, left, right, out)
     except KeyboardInterrupt:
         print_error("reports cancelled; write them with: companion report FLIGHT.mcap")
     except OSError as error:
         print_error(f"the reports cannot be written: {error.strerror}")
+    return None

@@ -327,15 +327,15 @@ def print_result(
         console.print(table, highlight=False)
 
 
-def print_team_result(console: Console, outcome: str, summary: dict[str, Any], out: Path) -> None:
+def print_team_result(console: Console, summary: dict[str, Any], path: Path) -> None:
     """Print the result of two vehicles that carry a bar.
 
     Args:
         console: where to print.
-        outcome: the worse outcome of both.
-        summary: `team`, with the figures of the bar, and `members`, with the summary of each.
-        out: folder of the flight.
+        summary: `outcome`, the worse one of both; `team`, with the figures of the bar; `members`, with the summary of each.
+        path: report of the flight, or the folder of a flight without one.
     """
+    outcome = summary["outcome"]
     facts = Table.grid(padding=(0, 2))
     facts.add_row("outcome", f"[{_OUTCOME_STYLE.get(outcome, 'bold red')}]{outcome}[/]")
     for end, member in summary["members"].items():
@@ -350,6 +350,6 @@ def print_team_result(console: Console, outcome: str, summary: dict[str, Any], o
         ("let go", "let_go", "m above its stand"),
     ):
         facts.add_row(name, "-" if team[key] is None else f"{team[key]:.3f} {unit}")
-    facts.add_row("files", str(out))
+    facts.add_row("report" if path.suffix == ".html" else "files", str(path))
     console.print()
     console.print(facts, highlight=False, soft_wrap=True)

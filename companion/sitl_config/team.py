@@ -49,6 +49,7 @@ def load_team(
     preset: str | None = None,
     on_hardware: End | None = None,
     world: str = TEAM_WORLD,
+    real_px4: bool = False,
 ) -> TeamConfig:
     """Read a team file and all files that it names, and check them.
 
@@ -59,6 +60,7 @@ def load_team(
         preset: as in `load_flight`, for both members.
         on_hardware: the member that this computer flies on hardware, with what only hardware needs; None in simulation.
         world: name of a built-in world, or path of a file.
+        real_px4: as in `load_sitl`.
 
     Raises:
         ConfigError: the files have problems, or the members do not go together; the exception has one message per problem.
@@ -88,6 +90,7 @@ def load_team(
                 own,
                 hardware=end == on_hardware,
                 world=world,
+                real_px4=real_px4,
             )
         except ConfigError as error:
             lines += [line for line in error.lines if line not in lines]

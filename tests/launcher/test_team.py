@@ -10,6 +10,11 @@ from typing import Any
 
 import pytest
 
+from companion.analysis.log import FlightLog
+from companion.analysis.pair import BarTruth
+from companion.analysis.pair_report import write_pair_report
+from companion.launcher.team import BAR_FILE
+from companion.model.codec import from_jsonable
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from tests.support import PREFLIGHT, ROOT, Sandbox, read_summary, set_options
 
@@ -36,8 +41,8 @@ FLY = ("team", "fly", TEAM, "--sitl", "--world", "ideal", "--speed", "max", "--o
         (("team", "fly", TEAM, "--out", "out"), "expected --sitl; on hardware each vehicle flies its part"),
         (("team", "fly", TEAM, "--sitl", "px4", "--out", "out"), "unknown arguments: px4"),
         (
-            ("team", "fly", TEAM, "--sitl=px4", "--out", "out"),
-            "expected --sitl, because a team flies with two PX4 stubs",
+            ("team", "fly", TEAM, "--sitl=px5", "--out", "out"),
+            "companion team: --sitl=px5: expected --sitl, --sitl=stub or --sitl=px4",
         ),
         (
             ("team", "fly", "carrry", "--sitl", "--out", "out"),
@@ -121,6 +126,20 @@ def test_a_team_carries_its_bar_over_wires(sandbox: Sandbox) -> None:
         for name in ("flight.mcap", "summary.json", "flight.log", "guardian.log"):
             assert (sandbox.cwd / "out" / end / name).exists()
     assert (sandbox.cwd / "out/team.key").stat().st_mode & 0o077 == 0
+    assert_the_report_shows_both(sandbox.cwd / "out", summary)
+
+
+def assert_the_report_shows_both(out: Path, summary: dict[str, Any]) -> None:
+    truth = from_jsonable(BarTruth, json.loads((out / "left" / BAR_FILE).read_text(encoding="utf-8")))
+    left, right = (FlightLog.read(out / end / "flight.mcap") for end in ("left", "right"))
+    page = write_pair_report(summary, truth, left, right, out).read_text(encoding="utf-8")
+    assert f"{summary['team']['bar_p_rms_m']:.3f} m" in page
+    assert 'href="left/report.html"' not in page, "it was not written"
+    movie = json.loads(page.split("id='movie'>")[1].split("</script>")[0])
+    vehicles = [[shape for shape in frame[1:] if len(shape) > 20] for frame in movie["frames"]]
+    assert len(movie["frames"]) > 50 and all(vehicles)
+    assert [len(curve) > 50 for curve in movie["curves"]] == [True, True]
+    assert (out / "bar.png").stat().st_size > 10_000
 
 
 def summary_in(out: Path) -> dict[str, Any]:
