@@ -131,9 +131,9 @@ class Launcher:
         self._cpu_contention = CpuContention({})
 
     @property
-    def flying(self) -> bool:
-        """Whether the flight process is ticking; False after the flight."""
-        return self._reports.flying
+    def begun(self) -> bool:
+        """Whether the flight process has ticked."""
+        return self._reports.begun
 
     def request_landing(self) -> None:
         """Request a landing (Ctrl-C); repeated requests change nothing."""

@@ -32,6 +32,8 @@ class FlightReports:
     def __init__(self) -> None:
         self.result: FlightEnded | None = None
         self.recorder_pid: int | None = None
+        self.begun = False
+        """Whether the flight process has ticked."""
         self.flying = False
         """Whether the flight process is ticking and sending ten status messages per second; False after the flight."""
         self.events: list[dict[str, Any]] = []
@@ -53,6 +55,7 @@ class FlightReports:
             case Started():
                 self.recorder_pid = message.recorder_pid
             case Status():
+                self.begun = True
                 self.flying = message.kind is not PhaseKind.DONE
             case FlightEvent():
                 self.events.append(message.for_summary())

@@ -106,7 +106,7 @@ class TeamLauncher:
         """Return what a member does at the end of its flight: it waits for the other, which does not take off any more."""
 
         def wait() -> None:
-            if not other.flying:
+            if not other.begun:
                 other.request_landing()
             with contextlib.suppress(threading.BrokenBarrierError):
                 self._over.wait()

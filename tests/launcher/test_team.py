@@ -110,6 +110,7 @@ def test_a_team_carries_its_bar_over_wires(sandbox: Sandbox) -> None:
     ended = sandbox.run(*FLY, "--no-report", "--seed", "1")
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_OK, ended
+    assert "landing commanded" not in ended.out, "the one that is ready first asks nothing of the other"
     summary = summary_in(sandbox.cwd / "out")
     assert summary["outcome"] == "completed"
     assert {end: member["outcome"] for end, member in summary["members"].items()} == {
