@@ -8,9 +8,7 @@ devices, in this process.
 from __future__ import annotations
 
 import re
-import socket
 from collections.abc import Iterator, Mapping
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -23,23 +21,12 @@ from companion.model.exit_codes import EXIT_REFUSED
 from companion.runtime.clock import flight_clock
 from companion.runtime.event_loop import run
 from tests.support import CATCH, Ended, Sandbox, World, read_summary, sandbox_in, set_options
-from tests.wires import serial_line
-
-"""Tests that share one world run in one process."""
-QUICK = {"discovery_timeout_s": 1.0}
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     with sandbox_in(tmp_path_factory.mktemp("world")) as sandbox, World(sandbox) as world:
         yield world
-
-
-def udp_port() -> socket.socket:
-    """A UDP port of 127.0.0.1 that is taken, and on which nobody speaks."""
-    taken = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    taken.bind(("127.0.0.1", 0))
-    return taken
 
 
 def refused(sandbox: Sandbox, world: World, *options: str) -> Ended:
@@ -77,55 +64,27 @@ FORCE_PORT = Wrong(
     r"^force sensor /dev/ttyNONE: no such port; .*; plug the sensor in or set devices\.force\.port$",
     {"port": "/dev/ttyNONE"},
 )
-ABSENT = Wrong(
-    r"^autopilot serial:///dev/ttyNONE:921600: expected the serial port /dev/ttyNONE, found No such file.*; plug",
-    {"address": "serial:///dev/ttyNONE:921600"},
-)
-ROUNDS: list[dict[str, Wrong]] = [
-    {
-        "autopilot": ABSENT,
-        "arm": Wrong(
-            r"^arm bus /dev/pts/\d+: servo 7 \(joint 2\): does not answer at 3000000 baud; ids that answer: 1, 2; check",
-            also={"vehicle.arm.joints[1].servo_id": 7},
-        ),
-        "mocap": Wrong(
-            r"^mocap 127\.0\.0\.1:\d+: rigid body id 7 was never seen within .*streams: 1 \"tarot650-2r\"; set devices\.mocap",
-            {"rigid_body_id": 7},
-        ),
-        "force": FORCE_PORT,
-    },
-    {
-        "autopilot": ABSENT,
-        "arm": Wrong(
-            r"^arm bus /dev/ttyNONE: no such port; .*; correct devices\.arm\.port or plug", {"port": "/dev/ttyNONE"}
-        ),
-        "mocap": Wrong(
-            r"^mocap 127\.0\.0\.1:\d+: .* speaks NatNet 4\.1, expected 3\.0; set .*devices\.mocap\.natnet_version$",
-            {"natnet_version": "3.0"},
-        ),
-    },
-    {
-        "autopilot": ABSENT,
-        "arm": Wrong(r"^arm bus /etc/hostname: is not a usable serial port", {"port": "/etc/hostname"}),
-        "mocap": Wrong(
-            r"^mocap 127\.0\.0\.1:\d+: cannot open UDP 192\.0\.2\.1:0: .*; set devices\.mocap\.interface",
-            {"interface": "192.0.2.1"},
-        ),
-    },
-    {
-        "autopilot": ABSENT,
-        "arm": Wrong(
-            r"^arm bus /dev/pts/\d+: servo 1 \(joint 1\): does not answer at 57600 baud; .*; check .*baud rate",
-            {"baud": 57600},
-        ),
-    },
-]
+WRONG: dict[str, Wrong] = {
+    "autopilot": Wrong(
+        r"^autopilot serial:///dev/ttyNONE:921600: expected the serial port /dev/ttyNONE, found No such file.*; plug",
+        {"address": "serial:///dev/ttyNONE:921600"},
+    ),
+    "arm": Wrong(
+        r"^arm bus /dev/pts/\d+: servo 7 \(joint 2\): does not answer at 3000000 baud; ids that answer: 1, 2; check",
+        also={"vehicle.arm.joints[1].servo_id": 7},
+    ),
+    "mocap": Wrong(
+        r"^mocap 127\.0\.0\.1:\d+: rigid body id 7 was never seen within .*streams: 1 \"tarot650-2r\"; set devices\.mocap",
+        {"rigid_body_id": 7},
+    ),
+    "force": FORCE_PORT,
+}
 
 
-def assert_named(world: World, wrong: Mapping[str, Wrong]) -> None:
-    """Open every device; those with something wrong fail, each with its line, and no other. Nothing is armed."""
-    but = {device: one.but for device, one in wrong.items()}
-    also = {key: value for one in wrong.values() for key, value in one.also.items()}
+def test_names_what_is_wrong_with_each_device_and_leaves_no_port_open(world: World) -> None:
+    """Each device is refused in its own words (`tests/io` has every reason), and nothing is armed."""
+    but = {device: one.but for device, one in WRONG.items()}
+    also = {key: value for one in WRONG.values() for key, value in one.also.items()}
     options = [word for word in (*world.addresses(**but), *set_options(**also)) if word != "--set"]
 
     async def opening() -> dict[str, str]:
@@ -133,62 +92,15 @@ def assert_named(world: World, wrong: Mapping[str, Wrong]) -> None:
             return available.failures
 
     found = run(opening())
-    assert found.keys() == wrong.keys(), found
-    for device, one in wrong.items():
+    assert found.keys() == WRONG.keys(), found
+    for device, one in WRONG.items():
         assert re.search(one.line, found[device]), (one.line, found[device])
     assert (world.armings, world.crashes) == (0, 0)
-
-
-@pytest.mark.parametrize("wrong", ROUNDS)
-def test_names_what_is_wrong_with_each_device_and_leaves_no_port_open(world: World, wrong: dict[str, Wrong]) -> None:
-    assert_named(world, wrong)
     with (
         serial.Serial(world.devices["arm"]["port"], exclusive=True),
         serial.Serial(world.devices["force"]["port"], exclusive=True),
     ):
         pass
-
-
-def test_names_ports_that_another_program_holds_and_a_silent_mocap_server(world: World) -> None:
-    with (
-        closing(udp_port()) as busy,
-        closing(udp_port()) as silent,
-        serial.Serial(world.devices["arm"]["port"], exclusive=True),
-        serial.Serial(world.devices["force"]["port"], exclusive=True),
-    ):
-        port, command_port = busy.getsockname()[1], silent.getsockname()[1]
-        wrong = {
-            "autopilot": Wrong(
-                rf"^autopilot udpin://.*: expected port {port} to be free, found another program on it; stop",
-                {"address": f"udpin://127.0.0.1:{port}", **QUICK},
-            ),
-            "arm": Wrong(r"^arm bus /dev/pts/\d+: port is busy; another program .*: close that one$"),
-            "force": Wrong(r"^force sensor /dev/pts/\d+: in use by another program; close it"),
-            "mocap": Wrong(
-                rf"^mocap 127\.0\.0\.1:{command_port}: no answer to the NatNet connect request within .*; is Motive running",
-                {"command_port": command_port},
-            ),
-        }
-        assert_named(world, wrong)
-
-
-def test_names_devices_that_are_silent(world: World) -> None:
-    with closing(udp_port()) as nobody, serial_line() as (_, arm), serial_line() as (_, force):
-        wrong = {
-            "autopilot": Wrong(
-                r"^autopilot udpout://.*: expected a PX4 heartbeat within 1 s, found none; power the autopilot",
-                {"address": f"udpout://127.0.0.1:{nobody.getsockname()[1]}", **QUICK},
-            ),
-            "arm": Wrong(
-                rf"^arm bus {arm}: servo 1 \(joint 1\): does not answer .*; no servo answers at all; check its",
-                {"port": arm},
-            ),
-            "force": Wrong(
-                f"^force sensor {force}: no answer .* nothing was received; check the sensor's power and cable$",
-                {"port": force},
-            ),
-        }
-        assert_named(world, wrong)
 
 
 def test_refuses_a_start_other_than_the_missions_though_it_refused_before(
