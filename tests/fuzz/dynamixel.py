@@ -1,31 +1,30 @@
-"""Servo bus: the real dynamixel-sdk and the arm driver's bus code, behind a serial port in memory or a real pty.
+"""Servo bus: the real dynamixel-sdk and the arm driver's bus code, behind a serial port in memory.
 
-In memory the port answers what the input says and time is simulated, so that a read that waits for ever is seen at once.
+The port answers what the input says and time is simulated, so that a read that waits for ever is seen at once.
 """
 
 from __future__ import annotations
 
-import asyncio
 import math
-import time
 from collections.abc import Callable
 from random import Random
 from typing import ClassVar, Self
 
-from companion.config.arm import Arm, Joint
 from companion.config.devices import ArmDevice
 from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.arm import DynamixelArm
 from companion.io.dynamixel.bus import ArmBus
 from companion.io.dynamixel.port import NOISE_BYTES, ServoPort
-from sitl.servo.bus import ServoBus, ServoLine
+from sitl.servo.bus import ServoLine
 from sitl.servo.model import ServoModel
 from sitl.servo.protocol import ALERT, Instruction, fast_status, packet, status
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Endless, Target, Wrong, one_line
-from tests.support import DEADLINE_S
+from tests.io.arm_rig import JOINTS, arm_config
 
-IDS = (11, 12)
+WIDE = tuple(joint.model_copy(update={"angle_deg": (-180.0, 180.0)}) for joint in JOINTS)
+"""The joints of the arm, at any angle."""
+IDS = tuple(joint.servo_id for joint in WIDE)
 _WATCHDOG_MS = 100
 _WATCHDOG = _WATCHDOG_MS // dxl.WATCHDOG_UNIT_MS
 _SIZE_MAX_BYTES = 2500
@@ -35,20 +34,6 @@ _OPEN_LIMIT_S = 30.0
 _REPLACE, _BEFORE, _BEHIND, _SILENCE = range(4)
 _READ, _OPEN, _BABBLE = range(3)
 """First byte of an input: answers to a flight's read; damage to the answers while the bus is opened; a line that never falls silent."""
-
-
-def arm_config() -> Arm:
-    return Arm(
-        shoulder_body_m=(0.0, 0.0, -0.05),
-        link_lengths_m=(0.2, 0.2),
-        link_masses_kg=(0.15, 0.05),
-        link_com_m=(0.1, 0.1),
-        torque_per_amp_nm_a=1.3,
-        joints=(
-            Joint(servo_id=IDS[0], sign=-1, zero_count=3072, angle_deg=(-180, 180), torque_max_nm=2.5),
-            Joint(servo_id=IDS[1], sign=1, zero_count=1024, angle_deg=(-180, 180), torque_max_nm=1.5),
-        ),
-    )
 
 
 class MemorySerial:
@@ -238,61 +223,10 @@ class DynamixelTarget(Target):
 
     def _new(self) -> tuple[DynamixelArm, ArmBus]:
         device = ArmDevice(port="memory", watchdog_ms=_WATCHDOG_MS)
-        arm = DynamixelArm(device, arm_config(), lambda: self._line.now_s)
+        arm = DynamixelArm(device, arm_config(*WIDE), lambda: self._line.now_s)
         arm._bus._port = arm._bus._servos.port = MemoryPort(self._line)
         self._line.reset_input_buffer()
         return arm, arm._bus
-
-
-class DynamixelWireTarget(Target):
-    """An input is noise on a real pty, before or during a read by the driver."""
-
-    name: ClassVar[str] = "dynamixel-wire"
-    inputs: ClassVar[int] = 1
-
-    def __init__(self) -> None:
-        self._corpus = _corpus()
-
-    def __enter__(self) -> Self:
-        self._loop = asyncio.new_event_loop()
-        self._loop.run_until_complete(self._open())
-        return self
-
-    async def _open(self) -> None:
-        self._bus = ServoBus([ServoModel(servo_id, baud_bps=3_000_000, shaft_angle_rad=3.1) for servo_id in IDS])
-        await self._bus.__aenter__()
-        self._arm = DynamixelArm(ArmDevice(port=self._bus.path), arm_config(), time.monotonic)
-        await self._arm.__aenter__()
-
-    def __exit__(self, *_: object) -> None:
-        self._loop.run_until_complete(self._arm.__aexit__(None, None, None))
-        self._loop.run_until_complete(self._bus.__aexit__(None, None, None))
-        self._loop.close()
-
-    def make(self, rng: Random) -> bytes:
-        return bytes((rng.randrange(2),)) + mutated(rng, self._corpus, _SIZE_MAX_BYTES)
-
-    def feed(self, data: bytes) -> None:
-        if data:
-            self._loop.run_until_complete(self._feed(data[0] == 1, data[1:]))
-
-    async def _feed(self, during: bool, noise: bytes) -> None:
-        arm = self._arm
-        if not during:
-            self._bus.inject(noise)
-            await arm.read(1.0)
-        else:
-            reading = asyncio.ensure_future(arm.read(1.0))
-            await asyncio.sleep(0)  # the request is on its way now, its answer is not
-            self._bus.inject(noise)
-            await reading
-        async with asyncio.timeout(DEADLINE_S):
-            while (state := await arm.read(1.0)) is None or state.read_failures:
-                pass
-        if arm.problem:
-            raise Wrong(f"an exception inside the bus code: {arm.problem}")
-        if state.hardware_error != (0, 0):
-            raise Wrong(f"hardware errors that no servo has: {state}")
 
 
 def _servos() -> ServoLine:

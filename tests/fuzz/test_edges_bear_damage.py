@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tests.fuzz.channels import ChannelsTarget
 from tests.fuzz.config import YamlTarget
-from tests.fuzz.dynamixel import DynamixelTarget, DynamixelWireTarget
+from tests.fuzz.dynamixel import DynamixelTarget
 from tests.fuzz.force import ForceTarget
 from tests.fuzz.mavlink import MavlinkTarget, MavlinkWireTarget
 from tests.fuzz.natnet import NatNetTarget
@@ -23,8 +23,7 @@ from tests.fuzz.target import Target, feed_watched
 TARGETS: dict[str, type[Target]] = {
     target.name: target
     for target in (
-        *(NatNetTarget, DynamixelTarget, DynamixelWireTarget, ForceTarget, MavlinkTarget, MavlinkWireTarget),
-        *(ChannelsTarget, YamlTarget),
+        *(NatNetTarget, DynamixelTarget, ForceTarget, MavlinkTarget, MavlinkWireTarget, ChannelsTarget, YamlTarget),
     )
 }
 REGRESSIONS = Path(__file__).parents[1] / "regressions" / "fuzz"

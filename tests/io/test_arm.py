@@ -7,7 +7,6 @@ import itertools
 import math
 import os
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -143,11 +142,14 @@ async def test_hardware_error_is_reported_and_never_rebooted() -> None:
         setup.servos[0].trip_overload()
         state = await state_when(setup.arm, lambda s: s.hardware_error != (0, 0))
         assert state.hardware_error == (0x20, 0)
+        setup.servos[1].set_temperature_c(85.0)
+        state = await state_when(setup.arm, lambda s: s.temperature_c[1] > 80.0)
+        assert state.hardware_error == (0x20, 0x04)
         for _ in range(50):
             setup.arm.write_torque((0.3, 0.3))
             state = await state_when(setup.arm, lambda s: s.read_failures == 0)
-            assert state.hardware_error == (0x20, 0)
-        assert [register(s, 64) for s in setup.servos] == [0, 1]
+            assert state.hardware_error == (0x20, 0x04)
+        assert [register(s, 64) for s in setup.servos] == [0, 0]
 
 
 async def test_servo_that_restarts_by_itself_is_a_lost_servo_not_an_angle_of_zero() -> None:
@@ -157,13 +159,6 @@ async def test_servo_that_restarts_by_itself_is_a_lost_servo_not_an_angle_of_zer
         setup.servos[1].reboot()
         state = await state_when(setup.arm, lambda s: s.read_failures >= 5)
         assert state.angle_rad == pytest.approx(before.angle_rad)
-
-
-async def test_overheating_is_reported_with_its_temperature() -> None:
-    async with flying_arm() as setup:
-        setup.servos[1].set_temperature_c(85.0)
-        state = await state_when(setup.arm, lambda s: s.temperature_c[1] > 80.0)
-        assert state.hardware_error == (0, 0x04)
 
 
 async def test_tripped_watchdog_is_shown_and_started_again() -> None:
@@ -354,16 +349,6 @@ async def test_noise_on_the_line_costs_reads_not_the_thread() -> None:
             await setup.arm.read(1.0)
         assert (await state_when(setup.arm, lambda s: s.read_failures == 0)).hardware_error == (0, 0)
         assert not setup.arm.problem
-
-
-async def test_reads_end_though_the_caller_waits_for_less() -> None:
-    async with flying_arm() as setup:
-        for servo in setup.servos:
-            servo.fail_silent(True)
-        state = await setup.arm.read(0.0)
-        assert state is not None
-        failed = await state_when(setup.arm, lambda s: s.read_failures > state.read_failures)
-        assert failed.stamp_s <= time.monotonic()
 
 
 async def test_a_read_begun_early_is_there_when_it_is_asked_for() -> None:

@@ -14,13 +14,7 @@ from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.port import usb_latency_ms
 from companion.io.dynamixel.scale import joint_scale, turn_offset_counts
 from companion.model.servos import WATCHDOG_ERROR, hardware_error_text
-
-KT = 1.3
-NM_PER_COUNT = KT * 2.69e-3
-JOINTS = (
-    Joint(servo_id=11, sign=-1, zero_count=3072, angle_deg=(-20, 180), torque_max_nm=2.5),
-    Joint(servo_id=12, sign=1, zero_count=1024, angle_deg=(-150, 150), torque_max_nm=1.5),
-)
+from tests.io.arm_rig import JOINTS, KT, NM_PER_COUNT
 
 
 def test_joint_angle_velocity_and_torque_follow_sign_and_zero() -> None:

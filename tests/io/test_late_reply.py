@@ -11,7 +11,8 @@ from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.bus import ArmBus
 from sitl.servo.bus import ServoLine
 from sitl.servo.model import ServoModel
-from tests.fuzz.dynamixel import IDS, MemoryPort, MemorySerial, arm_config
+from tests.fuzz.dynamixel import IDS, WIDE, MemoryPort, MemorySerial
+from tests.io.arm_rig import arm_config
 
 HELD_UP_S = 0.15
 """Longer than the timeout, shorter than the timeout and the pause after it."""
@@ -50,7 +51,7 @@ def servos() -> ServoLine:
 def opened(late_exchange: int) -> tuple[ArmBus, LateSerial]:
     line = LateSerial(late_exchange)
     line.answer = servos().feed
-    bus = ArmBus(ArmDevice(port="memory"), arm_config(), aborted=lambda: False)
+    bus = ArmBus(ArmDevice(port="memory"), arm_config(*WIDE), aborted=lambda: False)
     bus._port = bus._servos.port = MemoryPort(line)
     bus.open(30.0)
     return bus, line

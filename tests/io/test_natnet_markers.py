@@ -6,8 +6,7 @@ import asyncio
 import math
 import struct
 import time
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -22,7 +21,7 @@ from companion.model.types import Vec3
 from companion.runtime.clock import flight_clock
 from sitl.natnet import BodyPose, NatNetServer, encode_frame
 from tests.io.natnet_bytes import VERSIONS, full_frame, numbers
-from tests.io.test_mocap import POSE, device_for
+from tests.io.test_mocap import POSE, device_for, streaming
 from tests.support import DEADLINE_S
 
 TICKS_HZ = 10_000_000
@@ -99,28 +98,10 @@ def test_a_wrong_number_of_markers_never_raises(cut: int, count: int) -> None:
         assert isinstance(frame, Malformed) or all(map(math.isfinite, sum(frame.markers, ())))
 
 
-@asynccontextmanager
-async def streaming(server: NatNetServer, single: Sequence[Vec3], *poses: BodyPose) -> AsyncIterator[None]:
-    """Publish the vehicle's body, other bodies and single markers at about 200 Hz."""
-
-    async def publish() -> None:
-        while True:
-            now_s = time.monotonic()
-            server.publish(now_s, (POSE, *poses), now_s - 0.004, single)
-            await asyncio.sleep(0.005)
-
-    task = asyncio.create_task(publish())
-    try:
-        yield
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-
-
 async def received(single: Sequence[Vec3], *poses: BodyPose, **device: Any) -> tuple[MarkerFrame | None, MocapDriver]:
     """Return what a driver of this device has after some frames over real sockets."""
     arrived = asyncio.Event()
-    async with NatNetServer() as server, streaming(server, single, *poses):
+    async with NatNetServer() as server, streaming(server, POSE, *poses, single=single):
         driver = MocapDriver(
             device_for(server, **device), flight_clock(), lambda _: arrived.set(), connect_timeout_s=DEADLINE_S
         )
@@ -186,7 +167,7 @@ async def test_a_ball_with_a_body_of_its_own_is_the_only_marker_while_it_is_trac
 async def test_the_guardian_reads_no_markers() -> None:
     from companion.guardian.mocap import GuardianMocap
 
-    async with NatNetServer() as server, streaming(server, (BALL,)):
+    async with NatNetServer() as server, streaming(server, POSE, single=(BALL,)):
         guardian = GuardianMocap(settings_of(device_for(server, ball=MARKER)))
         try:
             deadline_s = time.monotonic() + DEADLINE_S

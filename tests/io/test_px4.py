@@ -275,30 +275,6 @@ async def test_a_request_that_the_core_no_longer_makes_is_never_repeated_by_the_
                 assert len(peer.commands(ARM_DISARM)) == count
 
 
-async def test_a_repeated_request_is_one_command_and_its_refusals_are_reported_once_in_words() -> None:
-    port = free_udp_port()
-    with Px4Peer(port) as peer:
-        peer.acks[ARM_DISARM] = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
-        clock = flight_clock()
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
-        async with MavsdkAutopilot(device, clock) as autopilot:
-            start_s = clock()
-
-            def refused_three_times() -> bool:
-                autopilot.request(AutopilotRequest.ARM)  # as the core does, in every tick
-                return len(peer.commands(ARM_DISARM)) == 3
-
-            await eventually(refused_three_times, "three refused ARM commands")
-            assert clock() - start_s >= 1.0  # a lower bound: at most one command each 0.5 s
-            reports: list[str] = []
-            await eventually(
-                lambda: reports.extend(autopilot.take_messages()) or autopilot._requests.pending() == 0,  # type: ignore[func-returns-value]
-                "the answers",
-            )
-            reports += autopilot.take_messages()
-        assert reports == ["ARM refused: temporarily rejected (MAV_RESULT 1)"]
-
-
 async def test_land_goes_out_while_arm_and_offboard_hang() -> None:
     async with linked() as (peer, autopilot):
         # In progress for as long as it takes: whatever waits for one of them waits for ever.
@@ -315,32 +291,6 @@ async def test_land_goes_out_while_arm_and_offboard_hang() -> None:
             "two refusals",
         )
     assert sorted(reports) == ["ARM refused: failed (MAV_RESULT 4)", "OFFBOARD refused: failed (MAV_RESULT 4)"]
-
-
-async def test_statustexts_become_lines_each_reported_once() -> None:
-    async with linked() as (peer, autopilot):
-        reports: list[str] = []
-
-        def text(severity: int, data: bytes, identity: int, chunk: int = 0) -> None:
-            peer.say(mavlink.MAVLink_statustext_message(severity, data, identity, chunk))
-
-        critical, info = mavlink.MAV_SEVERITY_CRITICAL, mavlink.MAV_SEVERITY_INFO
-        # The first after PX4's boot has the id 0 and chunks all the same.
-        text(critical, b"Arming denied: Resolve system health failures firs", 0, 0)
-        text(critical, b"t\t", 0, 1)
-        text(info, b"GCS connection regained\t", 1)
-        for identity in range(2, 5):
-            text(critical, b"Preflight Fail: heading estimate not stable", identity)
-        text(critical, b"exactly fifty characters, which may be a beginning", 5)
-        await eventually(
-            lambda: reports.extend(autopilot.take_messages()) or len(reports) >= 3,  # type: ignore[func-returns-value]
-            "three texts",
-        )
-    assert reports == [
-        "critical: Arming denied: Resolve system health failures first",
-        "critical: Preflight Fail: heading estimate not stable (PX4 does not arm while this holds)",
-        "critical: exactly fifty characters, which may be a beginning",
-    ]
 
 
 async def test_px4_sees_a_ground_station_for_as_long_as_it_is_not_armed() -> None:

@@ -15,14 +15,14 @@ from companion.model.types import (
     AttitudeSetpoint,
     AutopilotRequest,
     AutopilotStatus,
-    FlightMode,
-    LandedState,
     MocapPose,
 )
 from companion.runtime.clock import Clock, flight_clock
 from tests.io.stub_rig import standing_stub
 from tests.support import DEADLINE_S, eventually, free_udp_port
 
+AIDED = 16 | 32 | 256
+"""ESTIMATOR_POS_HORIZ_ABS, POS_VERT_ABS, PRED_POS_HORIZ_REL"""
 POSITION_WORLD_M = (-1.0, 0.5, 0.25)
 YAW_RAD = 0.4
 
@@ -78,57 +78,6 @@ async def companion(port: int) -> AsyncIterator[Companion]:
             yield half
         finally:
             running.cancel()
-
-
-AIDED = 16 | 32 | 256
-"""ESTIMATOR_POS_HORIZ_ABS, POS_VERT_ABS, PRED_POS_HORIZ_REL"""
-
-
-async def test_a_flight_on_the_floor_offboard_arm_land_disarm() -> None:
-    port = free_udp_port()
-    async with standing_stub(port, {"COM_OF_LOSS_T": 30.0}), companion(port) as half:
-        vehicle = half.autopilot.vehicle
-
-        def settled(_: AutopilotStatus) -> bool:
-            report = half.autopilot.estimator()
-            return (
-                report is not None
-                and report.flags & AIDED == AIDED
-                and 0.0 < report.position_horizontal_ratio < 0.5
-                and report.position_horizontal_accuracy_m < 0.02
-                and (state := vehicle()) is not None
-                and state.position_world_m == pytest.approx(POSITION_WORLD_M, abs=0.02)
-                and state.attitude_wxyz == pytest.approx(quat_from_euler_zyx(0.0, 0.0, YAW_RAD), abs=0.02)
-            )
-
-        await half.until(settled, "vision fused: PX4's pose is the one that mocap sent, in the companion's frames")
-        assert await half.autopilot.ensure_origin()
-        state = vehicle()
-        assert state is not None
-        assert state.specific_force_body_m_s2 == pytest.approx((0.0, 0.0, 9.81), abs=1e-3)
-        stamps: set[float] = set()
-        while len(stamps) < 50:
-            state = vehicle()
-            assert state is not None
-            stamps.add(state.imu_stamp_s)
-            await asyncio.sleep(0.001)
-        # PX4's default for HIGHRES_IMU is 50 Hz; loose, as the machine may be loaded.
-        assert min(b - a for a, b in zip(sorted(stamps), sorted(stamps)[1:], strict=False)) < 0.015
-        for request, done in (
-            (AutopilotRequest.OFFBOARD, lambda status: status.mode is FlightMode.OFFBOARD),
-            (AutopilotRequest.ARM, lambda status: status.armed),
-            (AutopilotRequest.LAND, lambda status: status.mode is FlightMode.LAND),
-            (AutopilotRequest.DISARM, lambda status: not status.armed),
-        ):
-            half.request = request
-            await half.until(done, request.name)
-        half.request = AutopilotRequest.NONE
-        await half.until(lambda status: status.landed is LandedState.ON_GROUND, "on the ground")
-        # The stub disarms only once its land detector is sure; until then it says so, and is asked again.
-        assert set(half.reports) <= {
-            "DISARM refused: temporarily rejected (MAV_RESULT 1)",
-            "critical: Disarming denied: not landed",
-        }
 
 
 async def test_the_stub_without_a_setpoint_stream_or_mocap() -> None:

@@ -14,7 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.guardian.link import Link
-from companion.io.px4.wire import ROUND_DATAGRAMS, SerialWire, TcpWire, UdpWire, Wire, open_wire
+from companion.io.px4.wire import ROUND_DATAGRAMS, UdpWire, Wire, open_wire
 from tests.support import DEADLINE_S, free_udp_port, wait_until
 from tests.wires import serial_line
 
@@ -148,31 +148,6 @@ def test_udpout_speaks_from_the_port_of_the_flight() -> None:
             wire.send(b"hello")
             data, address = px4.recvfrom(100)
             assert (data, address) == (b"hello", ("127.0.0.1", port))
-
-
-def test_tcpout() -> None:
-    with closing(socket.create_server(("127.0.0.1", 0))) as server:
-        server.settimeout(DEADLINE_S)
-        with opened(f"tcpout://127.0.0.1:{server.getsockname()[1]}") as wire:
-            assert isinstance(wire, TcpWire)
-            connection, _ = server.accept()
-            with connection:
-                connection.settimeout(DEADLINE_S)
-                wire.send(b"out")
-                assert connection.recv(100) == b"out"
-                connection.sendall(b"in")
-                wait_readable(wire)
-                assert received(wire) == [b"in"]
-
-
-def test_serial() -> None:
-    with serial_line() as (far, port), opened(f"serial://{port}:921600") as wire:
-        assert isinstance(wire, SerialWire)
-        wire.send(heartbeat())
-        assert os.read(far, 1000) == heartbeat()
-        os.write(far, heartbeat())
-        wait_readable(wire)
-        assert b"".join(received(wire)) == heartbeat()
 
 
 def test_a_serial_port_that_px4_does_not_drain_holds_nobody_up() -> None:

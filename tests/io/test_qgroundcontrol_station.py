@@ -18,6 +18,7 @@ from functools import partial
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.devices import AutopilotDevice
@@ -29,7 +30,7 @@ from companion.io.qgroundcontrol.channel import pack, unpack
 from companion.io.qgroundcontrol.relay import GONE
 from companion.io.qgroundcontrol.station import GroundStation, check_address
 from companion.io.qgroundcontrol.uplink_filter import UP_BURST, UP_RATE_HZ
-from companion.model.outputs import Outputs, TetherState
+from companion.model.outputs import Outputs
 from companion.model.types import (
     AttitudeSetpoint,
     AutopilotRequest,
@@ -37,20 +38,21 @@ from companion.model.types import (
     FlightMode,
     Inputs,
     LinkIdentity,
-    OperatorCommand,
-    PhaseKind,
     SafetyAction,
     Severity,
 )
 from companion.runtime.clock import flight_clock
+from tests.analysis.synthetic_flight import synthetic_flight
 from tests.io.px4_peer import POSITION_NED_M, Px4Peer
 from tests.io.qgroundcontrol_peer import GroundPeer
 from tests.io.stub_rig import standing_stub
+from tests.safety.healthy import SLOW
 from tests.support import CATCH, DEADLINE_S, eventually, free_udp_port
 
 LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.2)
-HOLD_MODE = (4 << 16) | (3 << 24)
-PILOT_MODE = 3 << 16
+NONE = AutopilotRequest.NONE
+ROW = next(iter(synthetic_flight()))
+"""Inputs and outputs of a tick."""
 
 
 def is_in_mode(autopilot: MavsdkAutopilot, mode: FlightMode) -> bool:
@@ -59,42 +61,13 @@ def is_in_mode(autopilot: MavsdkAutopilot, mode: FlightMode) -> bool:
 
 
 def inputs(tick: int = 0) -> Inputs:
-    return Inputs(
-        tick=tick,
-        t_s=tick * 0.005,
-        command=OperatorCommand.NONE,
-        recorder_dropped=0,
-    )
+    return replace(ROW[0], tick=tick, t_s=tick * 0.005)
 
 
 def outputs(tick: int = 0, phase: str = "approach", events: tuple[Event, ...] = ()) -> Outputs:
-    tether = TetherState(
-        range_m=1.5,
-        slack_m=0.75,
-        stop_slack_m=0.5,
-        elevation_rad=0.0,
-        clearance_m=1.0,
-        turns=0.0,
-        pull_n=0.0,
-        taut=False,
-        snagged=False,
-        separated=False,
-        vehicle_turns=0.0,
-    )
-    return Outputs(
-        tick=tick,
-        t_s=tick * 0.005,
-        mission_t_s=0.0,
-        phase=phase,
-        phase_kind=PhaseKind.FLIGHT,
-        progress=0.25,
-        attitude=LEVEL,
-        request=AutopilotRequest.NONE,
-        action=SafetyAction.NOMINAL,
-        events=events,
-        mocap_trusted=True,
-        tether=tether,
-        limited_by=(),
+    tether = replace(SLOW, slack_m=0.75, stop_slack_m=0.5)
+    return replace(
+        ROW[1], tick=tick, t_s=tick * 0.005, phase=phase, progress=0.25, request=NONE, events=events, tether=tether
     )
 
 
