@@ -61,12 +61,6 @@ BAD_MISSION = [
         [f"{CATCH}:18:3: limits.speed_max_km_h: unknown key; write speed_max_m_s, in m/s (not in km/h)"],
     ),
     ("arm_deg: [100.0, 60.0]", "arm_deg: stretched", [f'{CATCH}:39:14: phases[2].arm_deg: expected joint angles or a pose of the vehicle (folded, unfolded), got "stretched"; define it in arm.poses of the vehicle file']),
-    ("height_m: 1.0", "hieght_m: 1.0", [f"{CATCH}:30:5: phases[0].hieght_m: unknown key; did you mean height_m?"]),
-    (
-        "height_m: 1.0",
-        "height_m: 1.0\n    color: red",
-        [f"{CATCH}:31:5: phases[0].color: unknown key; known keys: name"],
-    ),
     (
         "height_m: 1.0",
         "height_m: 1 m",
@@ -77,8 +71,6 @@ BAD_MISSION = [
         "height_m: '1.0'",
         [f'{CATCH}:30:15: phases[0].height_m: expected a number > 0, got "1.0" (write 1.0 without quotes)'],
     ),
-    ("height_m: 1.0", "height_m: .nan", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got .nan"]),
-    ("height_m: 1.0", "height_m: true", [f"{CATCH}:30:15: phases[0].height_m: expected a number > 0, got true"]),
     ("    height_m: 1.0\n", "", [f"{CATCH}:29:5: phases[0].height_m: missing; expected a number > 0"]),
     (
         "to_m: [1.0, 0.0, 1.0]",
@@ -121,19 +113,10 @@ BAD_MISSION = [
         ],
     ),
     ("schema_version: 1", "schema_version: 2", [f"{CATCH}:6:17: schema_version: expected 1, got 2"]),
-    ("name: catch\nvehicle", "name: catch\nname: x\nvehicle", [f"{CATCH}:8:1: name: duplicate key, already given on line 7; remove one of the two"]),
     (
         "{law: adaptive, preset: recommended}",
         "{file: ../controllers/none.yaml}",
         [f"{CATCH}:9:20: controller.file: configs/controllers/none.yaml: no such file"],
-    ),
-    (
-        "name: settle\n    duration_s: 0.5",
-        "nmae: settle\n    duration_s: -1",
-        [
-            f"{CATCH}:33:5: phases[1].nmae: unknown key; did you mean name?",
-            f"{CATCH}:34:17: phases[1].duration_s: expected a number > 0 and <= 600, got -1",
-        ],
     ),
 ]  # fmt: skip
 
@@ -222,14 +205,10 @@ BAD_OVERRIDES = [
     ("world=1", "--set world: the key names a whole section; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world..a=1", "--set world..a: cannot read the key from column 6; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world.payload_kg=3", "--set world.payload_kg: expected a number from 0 to 2, got 3"),
-    ("world.payload_kg=.nan", "--set world.payload_kg: expected a number from 0 to 2, got .nan"),
-    ("world.seed=1.5", "--set world.seed: expected a whole number >= 0, got 1.5"),
     ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of 48 names ("mocap_loss", "mocap_occluded", "mocap_jump", ...), got "mocap_los" (did you mean mocap_loss?)'),
     ("world.throw_velocity_m_s=[1, 2", "--set world.throw_velocity_m_s: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"),
-    ("world.wind_m_s={a: 1, a: 2}", "--set world.wind_m_s: a: duplicate key, already given; remove one of the two"),
     ("mission.phases[9].duration_s=3", "--set mission.phases[9].duration_s: mission.phases has no index 9; available: 0 to 6"),
     ("mission.name.x=3", "--set mission.name.x: mission.name has no keys; it is a single value"),
-    ("mission.phases=[]", "--set mission.phases: expected a list of at least 2 items, got []"),
     ("mission.vehicle=none.yaml", "--set mission.vehicle: vehicle: none.yaml: no such file"),
     ("controller.rho_max=0", "--set controller.rho_max: expected a number > 0, got 0"),
     ("controller.stiffness_kp[2]=90", "--set controller.stiffness_kp[2]: gain_cond requires (K_d - M_d Phi) Phi = 144, got 90"),
@@ -274,10 +253,6 @@ BAD_LAW_IN_MISSION = [
         "{law: psc, preset: paper}",
         "controller.preset: 'psc' has no preset \"paper\"; available: tuned_extras, tuned",
     ),
-    (
-        "{preset: tuned}",
-        "controller.preset: 'adaptive' has no preset \"tuned\"; available: paper, paper_slow_leakage, model_free, recommended",
-    ),
 ]
 
 
@@ -303,7 +278,6 @@ def test_the_preset_option_is_of_the_missions_law(project: Path) -> None:
 
 BAD_LAW_IN_FILE = [
     ("law: csk", ':2:6: law: expected one of adaptive, csc, psc, policy, got "csk" (did you mean csc?)'),
-    ("law: 3", ":2:6: law: expected one of adaptive, csc, psc, policy, got 3"),
     ("# law: csc", ":1:1: law: missing; expected one of adaptive, csc, psc, policy"),
 ]
 
@@ -314,20 +288,6 @@ def test_unknown_law_in_a_controller_file(project: Path, law: str, end: str) -> 
     (path.parent / "mine.yaml").write_text(f"schema_version: 1\n{law}\npreset: mine\n")
     path.write_text(path.read_text().replace("{law: adaptive, preset: recommended}", "{file: mine.yaml}"))
     assert lines_of(lambda: load_sitl(CATCH)) == [f"configs/missions/mine.yaml{end}"]
-
-
-BAD_COMPARISON_OVERRIDES = [
-    ("csc", "controller.model_mass_scale=0", "expected a number > 0, got 0"),
-    ("csc", "controller.stiffness=4", "unknown key; did you mean stiffness_kp?"),
-    ("psc", "controller.arm_inertia_md=[0]", "arm_inertia_md[0]: expected a number > 0, got 0"),
-    ("psc", "controller.payload_time_ms=100", "unknown key; write payload_time_s, in s (not in ms)"),
-]
-
-
-@pytest.mark.parametrize(("law", "option", "text"), BAD_COMPARISON_OVERRIDES)
-def test_bad_override_of_a_comparison_law(project: Path, law: str, option: str, text: str) -> None:
-    lines = lines_of(lambda: load_sitl(CATCH, controller_law=law, overrides=[option]))
-    assert lines == [f"--set {option.partition('=')[0]}: {text}"]
 
 
 def test_overrides_reach_every_section(project: Path) -> None:
