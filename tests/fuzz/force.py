@@ -1,11 +1,13 @@
-"""Force-torque sensor: bytes through a real pty into the read handler of a driver that runs with an emulated sensor."""
+"""Force-torque sensor: bytes through a real pty into the read handler of the driver."""
 
 from __future__ import annotations
 
 import asyncio
 import math
+import os
 import select
 import time
+from contextlib import ExitStack
 from random import Random
 from typing import ClassVar, Self
 
@@ -13,10 +15,10 @@ from companion.config.devices import ForceDevice
 from companion.io.force_torque import rft
 from companion.io.force_torque.driver import RobotousForceTorque
 from companion.io.force_torque.rft import RATE_CODES, Command, Wrench
-from sitl.force_torque import ForceTorqueServer
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Target, Wrong, one_line
 from tests.support import DEADLINE_S
+from tests.wires import serial_line
 
 _SIZE_MAX_BYTES = 3000
 """A pty buffers 4095 bytes."""
@@ -31,43 +33,19 @@ class ForceTarget(Target):
     name: ClassVar[str] = "force"
 
     def __init__(self) -> None:
-        self._sensor = ForceTorqueServer()
         self._corpus = _corpus()
         self._marks = [_wrench(0.0), _wrench(0.0), _wrench(_MARK_N)]
 
     def __enter__(self) -> Self:
-        self._loop = asyncio.new_event_loop()
-        self._loop.run_until_complete(self._open())
-        self._loop.remove_reader(self._fd)
-        # The last samples of the stream may be under way still: they must not be taken for the answer to an input.
-        self._sensor.inject(b"".join(self._marks))
-        while (sample := self._edge.latest()) is None or sample.force_sensor_n[0] != _MARK_N:
-            if not select.select([self._fd], [], [], DEADLINE_S)[0]:
-                raise TimeoutError("the pty did not deliver")
-            self._edge._on_readable()
+        self._loop, self._stack = asyncio.new_event_loop(), ExitStack()
+        self._far, port = self._stack.enter_context(serial_line())
+        self._edge = RobotousForceTorque(ForceDevice(port=port), time.monotonic)
+        self._edge._serial = self._stack.enter_context(self._edge._open())
+        self._fd = self._edge._serial.fileno()
         return self
 
-    async def _open(self) -> None:
-        await self._sensor.__aenter__()
-        self._edge = RobotousForceTorque(ForceDevice(port=self._sensor.port), time.monotonic)
-
-        async def stream() -> None:
-            t_s = 0.0
-            while True:
-                t_s += 0.005
-                self._sensor.tick(t_s)
-                await asyncio.sleep(0.005)
-
-        async with asyncio.TaskGroup() as group:
-            streaming = group.create_task(stream())
-            await self._edge.__aenter__()
-            streaming.cancel()
-        assert self._edge._serial is not None
-        self._fd = self._edge._serial.fileno()
-
     def __exit__(self, *_: object) -> None:
-        self._loop.run_until_complete(self._edge.__aexit__(None, None, None))
-        self._loop.run_until_complete(self._sensor.__aexit__(None, None, None))
+        self._stack.close()
         self._loop.close()
 
     def make(self, rng: Random) -> bytes:
@@ -82,7 +60,7 @@ class ForceTarget(Target):
         before, received = edge.counts(), edge._received_bytes
         # Behind any noise the scanner is in step again two packets later at the latest.
         sent = data + b"".join(self._marks)
-        self._sensor.inject(sent)
+        os.write(self._far, sent)
         while edge._received_bytes - received < len(sent):
             if not select.select([self._fd], [], [], DEADLINE_S)[0]:
                 raise TimeoutError("the pty did not deliver")

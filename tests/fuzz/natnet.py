@@ -1,8 +1,7 @@
-"""NatNet: datagrams through a real UDP socket into the datagram handler of a driver that runs with an emulated server."""
+"""NatNet: datagrams through a real UDP socket into the client that the flight, the guardian and the tools share."""
 
 from __future__ import annotations
 
-import asyncio
 import math
 import select
 import socket
@@ -12,13 +11,12 @@ from typing import ClassVar, Self
 
 from companion.config.devices import MocapDevice
 from companion.io.mocap import natnet
-from companion.io.mocap.client import NatNetClient
-from companion.io.mocap.driver import MocapDriver
+from companion.io.mocap.driver import settings_of
 from companion.io.mocap.natnet import Message
 from companion.io.mocap.optitrack import OptiTrack
 from companion.io.px4.messages import vision_ned
 from companion.model.types import MocapPose
-from sitl.natnet import BodyPose, NatNetServer, encode_frame, encode_model_definitions
+from sitl.natnet import BodyPose, encode_frame, encode_model_definitions
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Target, Wrong, one_line
 from tests.io.natnet_bytes import LATER, all_definitions, full_frame, numbers
@@ -30,7 +28,7 @@ _BODY_ID = 1
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 _DATAGRAM_MAX_BYTES = 60_000
 _FRESH = 0x80
-"""Bit of an input's first byte: the driver knows no server yet. The lower bits select the version."""
+"""Bit of an input's first byte: the client knows no server yet. The lower bits select the version."""
 
 
 def _version(mode: int) -> str:
@@ -38,7 +36,7 @@ def _version(mode: int) -> str:
 
 
 class NatNetTarget(Target):
-    """The first byte of an input is the version and the state of the driver; the rest is the datagram."""
+    """The first byte of an input is the version and the state of the client; the rest is the datagram."""
 
     name: ClassVar[str] = "natnet"
 
@@ -47,15 +45,12 @@ class NatNetTarget(Target):
         self._corpus = {version: _corpus(version) for version in VERSIONS}
 
     def __enter__(self) -> Self:
-        self._loop = asyncio.new_event_loop()
-        for version in VERSIONS:
-            self._rigs[version] = self._loop.run_until_complete(_Rig.opened(version))
+        self._rigs = {version: _Rig(version) for version in VERSIONS}
         return self
 
     def __exit__(self, *_: object) -> None:
         for rig in self._rigs.values():
-            self._loop.run_until_complete(rig.close())
-        self._loop.close()
+            rig.close()
 
     def make(self, rng: Random) -> bytes:
         mode = rng.randrange(len(VERSIONS)) | (_FRESH if rng.random() < 0.1 else 0)
@@ -70,94 +65,56 @@ class NatNetTarget(Target):
 
 
 class _Rig:
-    """A driver, and a socket in place of its server's."""
+    """Motive's client, and a socket in place of its server's."""
 
     def __init__(self, version: str) -> None:
-        self.version = version
-        self.server = NatNetServer(version)
-        self.t_s = 0.0
-        self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.sender.bind(("127.0.0.1", 0))
-
-    @classmethod
-    async def opened(cls, version: str) -> _Rig:
-        rig = cls(version)
-        await rig.server.__aenter__()
         fields = {
             "server": "127.0.0.1",
             "interface": "127.0.0.1",
             "transport": "unicast",
-            "command_port": rig.server.command_port,
-            "data_port": rig.server.data_port,
             "rigid_body_id": _BODY_ID,
             "up_axis": "y" if version == "3.0" else "z",
+            "ball": {"kind": "marker"},
+            "bar_id": 7,
         }
-        deadline_s = DEADLINE_S
-        rig.edge = MocapDriver(
-            MocapDevice.model_validate(fields), rig.clock, rig.on_pose, connect_timeout_s=deadline_s, body_timeout_s=deadline_s
-        )  # fmt: skip
+        self.version, self.t_s = version, 0.0
+        self.system = OptiTrack(settings_of(MocapDevice.model_validate(fields)))
+        self.client, self.socket = self.system.protocol, self.system.sockets[0]
+        self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sender.bind(("127.0.0.1", 0))
+        self._send(_server_info(version))
+        self._receive()
+        self.info = self.client.info
+        assert self.info is not None
 
-        async def publish() -> None:
-            while True:
-                rig.server.publish(1.0, [BodyPose(_BODY_ID, (0.0, 0.0, 1.0), _UPRIGHT)], 0.99)
-                await asyncio.sleep(0.01)
-
-        async with asyncio.TaskGroup() as group:
-            publisher = group.create_task(publish())
-            await rig.edge.__aenter__()
-            publisher.cancel()
-        system = rig.edge.client._client
-        assert isinstance(system, OptiTrack)
-        rig.system, rig.client = system, system.protocol
-        rig.socket, rig.info = system.sockets[0], rig.client.info
-        rig._take_what_waits()
-        return rig
-
-    async def close(self) -> None:
-        await self.edge.__aexit__(None, None, None)
-        await self.server.__aexit__(None, None, None)
+    def close(self) -> None:
+        self.system.close()
         self.sender.close()
 
-    def clock(self) -> float:
-        return self.t_s
-
-    def on_pose(self, pose: MocapPose) -> None:
-        vision_ned(pose)  # what the flight does with it; an exception shows in `callback_error`
-
     def feed(self, datagram: bytes, *, fresh: bool) -> None:
-        edge = self.edge
         if fresh:
             self.client.info = self.client.version = None
         self.t_s += 1.0
         self._send(datagram)
-        self._wait()
-        edge._receive()
+        self._receive()
         if fresh and (refusal := self.system.refusal()) is not None:
             one_line(refusal, "the refusal of a server")
         self._check_state()
         self._check_that_it_goes_on()
 
     def _check_state(self) -> None:
-        edge, pose = self.edge, self.edge.latest()
-        health = edge.counts()
-        if health.callback_error is not None:
-            edge._callback_error = None
-            raise Wrong(f"a pose that the autopilot edge refuses: {health.callback_error}")
-        if pose is not None:
-            numbers = (*pose.position_world_m, pose.marker_error_m, pose.latency_s or 0.0)
-            if not all(map(math.isfinite, numbers)):
-                raise Wrong(f"a pose that is not finite: {pose}")
-            if abs(math.hypot(*pose.attitude_wxyz) - 1.0) > 1e-9:
-                raise Wrong(f"an attitude that is not of unit norm: {pose}")
+        markers = self.system.markers()
+        for position_m in [] if markers is None else [one.position_world_m for one in markers.markers]:
+            if not all(map(math.isfinite, position_m)):
+                raise Wrong(f"a marker that is not finite: {markers}")
         for number, name in self.client.names.items():
             one_line(self.system._label(number), "the label of a rigid body")
             if len(name) > natnet.MAX_NAME_BYTES:
                 raise Wrong(f"a name of {len(name)} characters")
-        if health.problem is not None:
-            one_line(health.problem, "the reason for a malformed datagram")
+        if self.system.problem is not None:
+            one_line(self.system.problem, "the reason for a malformed datagram")
 
     def _check_that_it_goes_on(self) -> None:
-        edge = self.edge
         client = self.client
         client.info, client.version, client.names = self.info, numbers(self.version), {}
         self.t_s += 1.0  # as after the loss of some frames
@@ -165,28 +122,31 @@ class _Rig:
         x_m = float(number & 0x1FF)
         body = BodyPose(_BODY_ID, (x_m, 0.0, 0.0), _UPRIGHT)
         self._send(encode_frame(self.version, number, 1.0, [body], 0.99, {_BODY_ID: "b"}))
-        while (pose := edge.latest()) is None or pose.frame_number != number or pose.position_world_m[0] != x_m:
-            if not self._wait():
-                raise Wrong(f"a valid frame behind it is not understood: {edge.counts()}")
-            edge._receive()
+        poses = self._receive()
+        if not poses or (poses[-1].frame_number, poses[-1].position_world_m[0]) != (number, x_m):
+            raise Wrong(f"a valid frame behind it is not understood: {self.system.problem}, {self.system.counts()}")
 
     def _send(self, datagram: bytes) -> None:
         self.sender.sendto(datagram, self.socket.getsockname())
 
-    def _wait(self) -> bool:
-        """Wait for a datagram; return False if none arrived."""
-        return bool(select.select([self.socket], [], [], DEADLINE_S)[0])
+    def _receive(self) -> list[MocapPose]:
+        """Return the poses of the datagram that was sent, after what the flight does with them."""
+        if not select.select([self.socket], [], [], DEADLINE_S)[0]:
+            raise TimeoutError("the datagram was not delivered")
+        poses = self.system.poses(self.t_s)
+        for pose in poses:
+            vision_ned(pose)
+            if not all(map(math.isfinite, (*pose.position_world_m, pose.marker_error_m, pose.latency_s or 0.0))):
+                raise Wrong(f"a pose that is not finite: {pose}")
+            if abs(math.hypot(*pose.attitude_wxyz) - 1.0) > 1e-9:
+                raise Wrong(f"an attitude that is not of unit norm: {pose}")
+        return poses
 
-    def _take_what_waits(self) -> None:
-        """Read the last frames of the server that the driver connected to."""
-        while select.select([self.socket], [], [], 0.0)[0]:
-            self.edge._receive()
 
-    edge: MocapDriver
-    client: NatNetClient
-    system: OptiTrack
-    socket: socket.socket
-    info: natnet.ServerInfo | None
+def _server_info(version: str) -> bytes:
+    sender = struct.pack("<256s4s4s", b"Motive", bytes((3, 1, 0, 0)), bytes((*numbers(version), 0, 0)))
+    connection = struct.pack("<QH?4s", 10_000_000, 1511, True, bytes((239, 255, 42, 99)))
+    return natnet.encode_message(Message.SERVER_INFO, sender + connection)
 
 
 def _corpus(version: str) -> list[bytes]:
@@ -195,14 +155,13 @@ def _corpus(version: str) -> list[bytes]:
     bodies = [BodyPose(7, (3.0, 2.0, 0.1), (0.5, 0.5, 0.5, 0.5)), BodyPose(_BODY_ID, (1.0, -2.0, 1.5), _UPRIGHT)]
     lost = [BodyPose(_BODY_ID, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), valid=False)]
     crowd = [BodyPose(k, (float(k), 0.0, 0.0), _UPRIGHT) for k in range(40)]
+    single = [(1.0, 2.0, 0.5), (0.5, 0.25, 1.0)]
     frames = [
-        encode_frame(version, number, 12.5, poses, exposure_t_s, names)
+        encode_frame(version, number, 12.5, poses, exposure_t_s, names, single)
         for number, poses, exposure_t_s in ((900, bodies, 12.49), (901, lost, None), (902, [], 1.0), (903, crowd, 12.4))
     ]
     definitions = encode_model_definitions(version, list(names.items()))
-    sender = struct.pack("<256s4s4s", b"Motive", bytes((3, 1, 0, 0)), bytes((*numbers(version), 0, 0)))
-    connection = struct.pack("<QH?4s", 10_000_000, 1511, True, bytes((239, 255, 42, 99)))
-    server_info = natnet.encode_message(Message.SERVER_INFO, sender + connection)
+    server_info = _server_info(version)
     others = [
         natnet.encode_message(message, b"Bitstream,4.1\0") for message in Message if message is not Message.SERVER_INFO
     ]
@@ -214,7 +173,7 @@ def _corpus(version: str) -> list[bytes]:
         *[natnet.encode_message(Message.MODELDEF, definitions)] * 3,
         all_definitions(version),
         *[server_info] * 3,
-        natnet.encode_message(Message.SERVER_INFO, sender),
+        natnet.encode_message(Message.SERVER_INFO, server_info[4 : 4 + 264]),
         natnet.encode_connect(),
         b"",
         *others,
