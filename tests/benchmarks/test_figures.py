@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.measuring.figures import MET, NOT_MEASURED, NOT_MET, Row, Section, Target, problems
+from benchmarks.measuring.figures import MET, NOT_MEASURED, NOT_MET, Row, Target
 from benchmarks.measuring.hover import late_alone
 from benchmarks.measuring.late import alone_late
 from benchmarks.measuring.latency import Latency
@@ -19,12 +19,6 @@ def row(p50: float, p99: float, target: Target | None, beside: dict[str, float] 
         beside_figures={"p50": 1.0, "p99": 2.0} if beside is None else beside,
         target=target,
     )
-
-
-def test_ratios_are_of_each_statistic_to_the_same_of_what_ran_beside() -> None:
-    assert row(1.5, 5.0, None).ratios == {"p50": 1.5, "p99": 2.5}
-    assert row(1.5, 5.0, None, {"p99": 10.0}).ratios == {"p99": 0.5}
-    assert row(1.5, 5.0, None, {"p50": 0.0, "p99": 10.0}).ratios == {"p99": 0.5}, "nothing is a multiple of 0"
 
 
 @pytest.mark.parametrize(
@@ -44,16 +38,6 @@ def test_every_figure_that_a_target_names_must_meet_it(
     p50: float, p99: float, target: Target | None, verdict: str
 ) -> None:
     assert row(p50, p99, target).verdict == verdict
-
-
-def test_problems_name_what_is_not_met_or_not_measured_and_why() -> None:
-    missing = Row(
-        what="core", beside="", figures={}, beside_figures={}, target=Target(1.0), why_not="the bus did not start"
-    )
-    told = problems(
-        [Section("", (), (), [row(1.0, 1.0, Target(1.5)), row(9.0, 9.0, Target(1.5)), row(9.0, 9.0, None), missing])]
-    )
-    assert told == ["loop beside bare: not met", "core: not measured: the bus did not start"]
 
 
 def test_a_tick_is_alone_late_unless_the_loop_beside_was_late_close_to_it() -> None:

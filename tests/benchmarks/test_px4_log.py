@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.px4_log import AfterFault, Change, Px4Log, newest
+from benchmarks.px4_log import AfterFault, Change, Px4Log
 from sitl.px4.hil_link import Px4Error
 
 FAULT_S = 20.0
@@ -55,11 +55,6 @@ def test_what_never_happened_is_none() -> None:
 
 def test_modes_are_those_that_flew() -> None:
     assert log(HOLD, OFFBOARD, LAND, DISARMED).modes() == "OFFBOARD, LAND"
-
-
-def test_no_log_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(Px4Error, match="expected a log of PX4 in px4/log, found none; fly it with --sitl=px4"):
-        newest(tmp_path)
 
 
 def test_a_file_that_is_none_is_one_line(tmp_path: Path) -> None:

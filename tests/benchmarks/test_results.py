@@ -215,15 +215,3 @@ sys.exit(command.main(["--out", {str(out)!r}, "--only", "core", "--only", "hover
         assert started.wait(DEADLINE_S) == 130, rest
     assert (out / "hover/landed").exists()
     assert list(json.loads((out / "results.json").read_text())["parts"]) == ["core"]
-
-
-def test_a_part_says_in_one_line_what_broke(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def breaks(folder: Path, quick: bool, say: command.Say) -> dict[str, Any]:
-        raise RuntimeError("first\n  second")
-
-    monkeypatch.setitem(command.PARTS, "core", breaks)
-    assert command.run_part("core", tmp_path, False) == 1
-    assert capsys.readouterr().err == "first second\n"
-    assert not (tmp_path / "figures.json").exists()

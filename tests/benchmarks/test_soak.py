@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -16,7 +15,6 @@ from benchmarks.soaking.processes import family, pss_mb, usage
 from benchmarks.soaking.verdict import ROLES, Sample, airborne, lateness_problems, memory_growth, thirds
 from companion.analysis.log import FlightLog
 from tests.analysis.synthetic_flight import record_flight
-from tests.support import DEADLINE_S
 
 PERIOD_S = 0.005
 GOOD = {
@@ -133,26 +131,3 @@ def test_processes_are_found_by_what_they_run_and_measured() -> None:
     own = usage(os.getpid())
     assert own is not None
     assert own.cpu_s > 0.0
-
-
-def test_the_empty_loop_ends_when_asked_and_says_how_late_it_was(tmp_path: Path) -> None:
-    out = tmp_path / "empty.json"
-    command = [sys.executable, "-c", f"""
-import os, signal, threading
-from pathlib import Path
-from benchmarks.soaking import lateness
-from tests.support import DEADLINE_S
-ticks = []
-take = lateness.Minutes.take
-def counting(self, start_s, late_s):
-    ticks.append(start_s)
-    if len(ticks) == 50:
-        os.kill(os.getpid(), signal.SIGTERM)
-    take(self, start_s, late_s)
-lateness.Minutes.take = counting
-lateness.run_empty_loop(Path({str(out)!r}))
-"""]  # fmt: skip
-    subprocess.run(command, check=True, timeout=DEADLINE_S, cwd=Path(__file__).parents[2])
-    read = json.loads(out.read_text())
-    assert set(read) == {"minutes", "missed", "skipped"}
-    assert read["minutes"] == [], "a quarter of a second is no minute"

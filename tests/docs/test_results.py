@@ -112,23 +112,3 @@ def test_the_page_says_how_the_laboratory_differs_from_the_paper() -> None:
     assert made["published"].count("Flown by") == 2
     assert "| adaptive/paper | 0.2 kg | 0 % | 0.400 | 0.200 | -50 % | 6 of 6 | 0.03 |" in made["adaptation"]
     assert made.keys().isdisjoint(("model error", "extras")), "not flown: the page keeps its tables"
-
-
-def test_results_of_different_worlds_do_not_share_a_page() -> None:
-    with pytest.raises(ValueError, match="different worlds: ideal, lab"):
-        compare_doc.tables([compared(), compared("ideal")])
-
-
-def test_plots_of_the_same_rows_are_the_same_bytes(tmp_path: Path) -> None:
-    (tmp_path / "compare.json").write_text(json.dumps(compared()), encoding="utf-8")
-    tables = [f"<!-- table: {table} -->\n<!-- end: {table} -->\n" for table in PAGES["compare"][0]]
-    drawn = []
-    for name in ("a", "b"):
-        page = tmp_path / name / "page.md"
-        page.parent.mkdir()
-        page.write_text("".join(tables), encoding="utf-8")
-        assert compare_doc.main([str(page), str(tmp_path / "compare.json")]) == 0
-        drawn.append({path.name: path.read_bytes() for path in (page.parent / "pictures").iterdir()})
-    shown = re.findall(r"!\[.+\]\(pictures/(.+)\)", page.read_text(encoding="utf-8"))
-    assert set(drawn[0]) == set(shown) == {"compare_adaptation.svg"}
-    assert drawn[0] == drawn[1]

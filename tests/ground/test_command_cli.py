@@ -162,11 +162,9 @@ async def leave_states(broker: Broker) -> None:
     ("arguments", "why"),
     [
         (["jump"], "invalid choice: 'jump'"),
-        (["hold", "--broker", "http://x"], "--broker: expected mqtt://"),
         (["hold", "--vehicle", "a/b"], "--vehicle 'a/b': expected a vehicle name"),
         (["hold", "--operators", "nofile.yaml"], "nofile.yaml: no such file"),
         (["hold", "--broker", "mqtt://192.0.2.1"], "is not encrypted"),
-        (["hold", "--login", "nofile.yaml"], "nofile.yaml: no such file"),
     ],
 )
 def test_bad_input(arguments: list[str], why: str, capsys: pytest.CaptureFixture[str]) -> None:

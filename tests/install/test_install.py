@@ -161,21 +161,17 @@ def fail_at_the_third_file(monkeypatch: pytest.MonkeyPatch, failure: BaseExcepti
     monkeypatch.setattr(apply, "write_state", until_then)
 
 
-def test_a_full_disk_half_way_leaves_everything_as_it_was(
-    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("failure", "code"),
+    [(OSError(errno.ENOSPC, "No space left on device", "/etc/x"), EXIT_REFUSED), (KeyboardInterrupt(), EXIT_ABORTED)],
+    ids=["full disk", "Ctrl-C"],
+)
+def test_a_failure_half_way_leaves_everything_as_it_was(
+    root: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException, code: int
 ) -> None:
     before = tree(root)
-    fail_at_the_third_file(monkeypatch, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/etc/x"))
-    assert install(root) == EXIT_REFUSED
-    assert tree(root) == before
-    [line] = capsys.readouterr().err.splitlines()
-    assert line == "companion install: /etc/x: No space left on device; all changes were reverted"
-
-
-def test_interrupted_half_way_everything_is_as_it_was(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = tree(root)
-    fail_at_the_third_file(monkeypatch, KeyboardInterrupt())
-    assert install(root) == EXIT_ABORTED
+    fail_at_the_third_file(monkeypatch, failure)
+    assert install(root) == code
     assert tree(root) == before
 
 
@@ -257,13 +253,6 @@ def test_keys_go_with_the_user_who_is_deleted_and_stay_with_one_who_stays(
     assert keys.exists() is not goes
     assert log.exists() and (others / "secret").exists()
     assert ("the service's keys" in capsys.readouterr().out) is goes
-
-
-def test_undo_without_an_installation_says_so(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = tree(root)
-    assert undo(root) == EXIT_OK
-    assert "nothing to undo" in capsys.readouterr().out
-    assert tree(root) == before
 
 
 def test_without_a_yes_nothing_is_done(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

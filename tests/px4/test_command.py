@@ -140,27 +140,6 @@ def test_another_type_than_px4s_is_reported_and_not_written(tmp_path: Path, caps
         assert peer.of("PARAM_SET") == []
 
 
-def test_a_bad_address_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert params(99999, "--diff") == EXIT_BAD_INPUT
-    assert capsys.readouterr().err == "--address: expected a port from 1 to 65535, got 99999\n"
-
-
-def test_a_damaged_file_is_reported_before_anything_is_opened(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "mine.params"
-    path.write_text("1\t1\tA\tx\t6\n", encoding="utf-8")
-    assert params(1, "--diff", str(path)) == EXIT_BAD_INPUT
-    assert capsys.readouterr().err.startswith(f"{path}:1: A: expected a whole number")
-
-
-@pytest.mark.parametrize("words", [[], ["--diff", "--write"], ["--diff", "--vehicle", "a", "--address", "b"]])
-def test_a_wrong_command_line_is_refused(words: list[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["px4", "params", *words])
-    assert caught.value.code == EXIT_BAD_INPUT
-
-
 def test_a_comparison_knows_values_as_px4_stores_them() -> None:
     comparison = compare({"A": 0.1, "B": 1, "MAV_1_CONFIG": 102}, {"A": single(0.1), "B": 1})
     assert comparison.same
