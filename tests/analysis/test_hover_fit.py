@@ -26,7 +26,7 @@ def logged() -> FlightLog:
     config = configured(ERROR, False)
     airframe = config.vehicle.airframe.model_copy(update={"hover_thrust": true_hover_thrust() * (1.0 + ERROR)})
     vehicle = config.vehicle.model_copy(update={"airframe": airframe})
-    return log_of(config.model_copy(update={"vehicle": vehicle}), flown(ERROR, False), None)
+    return log_of(config.model_copy(update={"vehicle": vehicle}), flown(ERROR, 16.0, adapt=False), None)
 
 
 def changed(log: FlightLog, change: Callable[[Inputs, Outputs], tuple[Inputs, Outputs]]) -> FlightLog:

@@ -12,11 +12,12 @@ from companion.control.hover_thrust import SHARE_MAX, HoverThrust
 from companion.control.types import PlantState
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.types import IDENTITY_QUAT, Outcome, PhaseKind, Quat, Vec3
+from companion.model.types import IDENTITY_QUAT, PhaseKind, Quat, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from tests.control.states import at
+from tests.flights.ends import flown_until
 from tests.support import CATCH, SHORT_CATCH
 
 MASS_KG = 3.0
@@ -108,10 +109,11 @@ def test_the_hover_thrust_is_bounded(thrust: float, bound: float) -> None:
 
 
 def flown(
-    error: float, adapt: bool = True, faults: str = "[]", mission: Path = CATCH, until_mission_s: float = math.inf
+    error: float, until_mission_s: float, adapt: bool = True, faults: str = "[]", mission: Path = CATCH
 ) -> FastResult:
-    result = FastFlight(configured(error, adapt, faults, mission)).run(until_mission_s=until_mission_s)
-    assert result.caught and result.outputs[-1].outcome in (None, Outcome.COMPLETED)
+    flight = FastFlight(configured(error, adapt, faults, mission))
+    result = flown_until(flight, lambda o: o.mission_t_s >= until_mission_s)
+    assert result.caught and not result.crashed and result.outputs[-1].outcome is None
     return result
 
 
@@ -143,7 +145,7 @@ def height_errors_m(result: FastResult, from_s: float) -> list[float]:
 def test_a_wrong_parameter_is_flown_out() -> None:
     """10 % would be 5 cm of height for ever; from 4 s on it is below 2 cm, catch and payload included."""
     error = -0.1
-    result = flown(error, until_mission_s=8.5)
+    result = flown(error, 8.5)
     assert max(abs(e) for e in height_errors_m(result, 4.0)) < 0.02
     used = [outputs.control.hover_thrust for outputs in result.outputs if outputs.control]
     assert used[0] == pytest.approx(true_hover_thrust() * (1.0 + error))
@@ -151,14 +153,14 @@ def test_a_wrong_parameter_is_flown_out() -> None:
 
 
 def test_switched_off_it_stays_at_the_parameter() -> None:
-    result = flown(0.1, adapt=False, mission=SHORT_CATCH)
+    result = flown(0.1, 4.4, adapt=False, mission=SHORT_CATCH)
     assert {o.control.hover_thrust for o in result.outputs if o.control} == {true_hover_thrust() * 1.1}
     assert max(abs(e) for e in height_errors_m(result, 3.0)) > 0.035
 
 
 def test_a_catch_without_force_sensor_does_not_move_it() -> None:
     """The sensor dies after the catch: what hangs there can no longer be told from a weak motor."""
-    result = flown(0.0, faults="[{kind: force_loss, t_s: 5.7}]", mission=SHORT_CATCH)
+    result = flown(0.0, 5.0, faults="[{kind: force_loss, t_s: 5.7}]", mission=SHORT_CATCH)
     lost_s = next(e.t_s for o in result.outputs for e in o.events if e.id == "force_lost")
     later = {o.control.hover_thrust for o in result.outputs if o.control and o.t_s > lost_s + 0.1}
     assert len(later) == 1

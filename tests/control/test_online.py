@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from companion.control.online import TANK_MAX_J, OnlineImpedance
 from companion.control.types import Tuning
 from companion.core.flight_core import FlightCore
 from companion.model.outputs import Outputs
-from companion.model.types import Chi, Inputs, OperatorCommand, PhaseKind, SafetyAction, Vec3
+from companion.model.types import Chi, OperatorCommand, PhaseKind, SafetyAction, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
@@ -144,7 +145,7 @@ def scales(outputs: list[Outputs]) -> list[float]:
     ]
 
 
-def test_a_flight_reports_the_changes_undoes_them_proposes_them_and_replays(
+def test_a_flight_reports_the_changes_undoes_them_and_proposes_them(
     soft: tuple[SitlConfig, FastResult], tmp_path: Path
 ) -> None:
     config, result = soft
@@ -155,8 +156,6 @@ def test_a_flight_reports_the_changes_undoes_them_proposes_them_and_replays(
     texts = [event.text for o in result.outputs for event in o.events if event.id == "impedance_scaled"]
     assert len(texts) >= 3
     assert "undone" in texts[-1]
-    core = FlightCore(config.flight)
-    assert [core.step(i) for i in result.inputs] == result.outputs
     file = tmp_path / "controller.yaml"
     write_proposal(log_of(config.flight, result, None), file)
     proposed = load_flight("configs/missions/circuit.yaml", controller_law=str(file)).controller
@@ -165,20 +164,15 @@ def test_a_flight_reports_the_changes_undoes_them_proposes_them_and_replays(
     assert proposed.phi[0] == pytest.approx(best * config.controller.phi[0], rel=1e-5)
 
 
-@pytest.mark.parametrize("cause", ["hold", "stale pose"])
-def test_a_hold_or_a_stale_pose_freezes_the_scale(soft: tuple[SitlConfig, FastResult], cause: str) -> None:
+def test_it_replays_and_a_hold_or_a_stale_pose_freezes_the_scale(soft: tuple[SitlConfig, FastResult]) -> None:
     config, result = soft
     begin = next(k for k, o in enumerate(result.outputs) if o.control and (o.control.impedance_scale or 1.0) > 1.1)
-
-    def disturbed(i: Inputs) -> Inputs:
-        if cause == "hold":
-            return replace(i, command=OperatorCommand.HOLD)
-        return replace(i, mocap=result.inputs[begin].mocap)
-
     core = FlightCore(config.flight)
-    for i in result.inputs[:begin]:
-        core.step(i)
-    after = [core.step(disturbed(i)) for i in result.inputs[begin : begin + 100]]
-    assert after[-1].action is not SafetyAction.NOMINAL or cause == "stale pose"
-    assert len(set(scales(after)[30:])) == 1
+    for i, o in zip(result.inputs[:begin], result.outputs, strict=False):
+        assert core.step(i) == o
+    for cause in ({"command": OperatorCommand.HOLD}, {"mocap": result.inputs[begin].mocap}):
+        disturbed = copy.deepcopy(core)
+        after = [disturbed.step(replace(i, **cause)) for i in result.inputs[begin : begin + 100]]
+        assert after[-1].action is not SafetyAction.NOMINAL or "mocap" in cause
+        assert len(set(scales(after)[30:])) == 1
     assert len(set(scales(result.outputs[begin : begin + 100])[30:])) > 1

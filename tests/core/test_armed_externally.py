@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -29,16 +30,13 @@ from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from tests.safety.healthy import healthy, put
+from tests.support import CATCH, SHORT_CATCH
 
 replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
 
 
-def configured(*overrides: str) -> SitlConfig:
-    return load_sitl("configs/missions/catch.yaml", preset="recommended", overrides=overrides)
-
-
-CONFIG = FastFlight(configured()).config
+CONFIG = FastFlight(load_sitl(CATCH)).config
 HIGH, STANDING = (0.0, 0.0, 1.0), (0.0, 0.0, CONFIG.vehicle.airframe.ground_clearance_m)
 
 
@@ -69,7 +67,7 @@ EVERY = list(itertools.product(FlightMode, LandedState, ("high", "standing")))
 @pytest.mark.parametrize(("mode", "landed", "where"), EVERY)
 def test_every_mode_landed_state_and_height(mode: FlightMode, landed: LandedState, where: str) -> None:
     height = HIGH if where == "high" else STANDING
-    outputs = stepped([found(mode, landed, height, tick) for tick in range(150)])
+    outputs = stepped([found(mode, landed, height, tick) for tick in range(100)])
     ours = mode in (FlightMode.OFFBOARD, FlightMode.LAND)
     stands = landed is LandedState.ON_GROUND and where == "standing" and ours
     assert ids(outputs).count("armed_externally") == 1
@@ -100,7 +98,7 @@ def test_whatever_else_is_wrong_it_lands(mode: FlightMode, command: OperatorComm
         i = replace(found(mode, LandedState.IN_AIR, HIGH, k), command=command, guardian_ready=False)
         return replace(i, **{lost: None}) if lost else i
 
-    outputs = stepped([tick(k) for k in range(60)])
+    outputs = stepped([tick(k) for k in range(30)])
     assert {o.request for o in outputs} == {AutopilotRequest.LAND}
     assert all(o.attitude is None and o.outcome is None for o in outputs)
     assert "armed_externally" in ids(outputs[:1])
@@ -108,7 +106,7 @@ def test_whatever_else_is_wrong_it_lands(mode: FlightMode, command: OperatorComm
 
 def test_armed_by_somebody_else_while_the_companion_waits_it_does_not_take_off() -> None:
     """On the ground, in the mode that the companion itself has asked for."""
-    flight = FastFlight(configured())
+    flight = FastFlight(load_sitl(CATCH))
     inputs = flight.run(limit_s=2.1).inputs
     core, outputs = FlightCore(flight.config), []
     for i in inputs:
@@ -165,20 +163,24 @@ class Dies:
         return not self._dead and self._core.forwards(pose, vehicle)
 
 
-def flown(died_s: float, back_s: float, change: Change = lambda i: i) -> tuple[FastFlight, FastResult]:
+def flown(
+    died_s: float, back_s: float, change: Change = lambda i: i, mission: Path = SHORT_CATCH
+) -> tuple[FastFlight, FastResult]:
     class Flight(FastFlight):
         def _inputs(self, tick: int) -> Inputs:
             return change(super()._inputs(tick))
 
-    flight = Flight(configured())
+    flight = Flight(load_sitl(mission))
     flight.core = Dies(flight.config, died_s, back_s)  # type: ignore[assignment]
     return flight, flight.run()
 
 
-@pytest.mark.parametrize(("died_s", "gone_s"), [(7.2, 8.0), (11.6, 0.1), (11.6, 2.5)])
-def test_started_again_in_the_air_it_lands_what_still_flies(died_s: float, gone_s: float) -> None:
+@pytest.mark.parametrize(
+    ("mission", "died_s", "gone_s"), [(CATCH, 7.2, 8.0), (CATCH, 11.6, 0.1), (SHORT_CATCH, 7.8, 2.5)]
+)
+def test_started_again_in_the_air_it_lands_what_still_flies(mission: Path, died_s: float, gone_s: float) -> None:
     """PX4 has been without motion capture: after 4.5 s it descends blindly and never finds that it stands."""
-    flight, result = flown(died_s, died_s + gone_s)
+    flight, result = flown(died_s, died_s + gone_s, mission=mission)
     after = [o for o in result.outputs if o.t_s >= died_s + gone_s]
     assert ids(after)[0] == "armed_externally"
     assert result.outputs[-1].outcome is Outcome.ABORTED
@@ -204,18 +206,18 @@ def assert_folds_at_a_bounded_rate(result: FastResult, since_s: float) -> None:
 
 
 def test_with_a_dead_arm_bus_it_lands_all_the_same() -> None:
-    flight, result = flown(11.6, 11.8, lambda i: replace(i, arm=None, force=None) if i.t_s >= 11.6 else i)
+    flight, result = flown(7.8, 8.0, lambda i: replace(i, arm=None, force=None) if i.t_s >= 7.8 else i)
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert not result.crashed and not flight.px4.armed
-    assert all(o.arm_torque_nm is None for o in result.outputs if o.t_s >= 11.6)
+    assert all(o.arm_torque_nm is None for o in result.outputs if o.t_s >= 7.8)
 
 
 def test_a_pilot_who_flies_is_only_given_motion_capture() -> None:
     def change(i: Inputs) -> Inputs:
-        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 11.6 else i
+        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 7.8 else i
 
-    _, result = flown(11.6, 11.8, change)
-    after = [o for o in result.outputs if o.t_s >= 11.8]
+    _, result = flown(7.8, 8.0, change)
+    after = [o for o in result.outputs if o.t_s >= 8.0]
     assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
     assert ids(after).count("armed_externally") == 1
     assert after[-1].outcome is Outcome.ABORTED, "PX4 disarmed"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import json
 from collections.abc import Callable
@@ -23,12 +22,12 @@ from companion.ground.telemetry.stream import replay
 from companion.mission.check import check_mission
 from companion.model.contact import ContactMode
 from companion.model.outputs import Outputs
-from companion.model.types import Inputs, OperatorCommand, Outcome
+from companion.model.types import Inputs, OperatorCommand
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
-from tests.flights.ends import after, contact_over
+from tests.flights.ends import after, contact_over, flown_until
 
 PRESS = "configs/missions/press.yaml"
 SHORT = (
@@ -36,7 +35,7 @@ SHORT = (
     "mission.phases[0]={type: takeoff, height_m: 0.7, duration_s: 1.8}",
     "mission.phases[1].duration_s=0.1",
     "mission.phases[2].to_m=[0.66,0.0,0.7]",
-    "mission.phases[4].duration_s=4.0",
+    "mission.phases[4].duration_s=3.0",
     "mission.phases[6].to_m=[0.5,0.0,0.7]",
 )
 """The mission with less of a way to the wall and back."""
@@ -62,6 +61,7 @@ def press(
     """
     overrides = [
         *SHORT,
+        "mission.phases[2].to_m=[0.7,0.0,0.7]",
         f"world.surfaces={json.dumps([WALL | (wall or {})])}",
         f"mission.phases[3].speed_m_s={approach_m_s}",
         f"mission.phases[3].face_m={json.dumps(face_m)}",
@@ -95,14 +95,14 @@ def force_n(result: FastResult) -> np.ndarray[Any, Any]:
 @pytest.fixture(scope="module")
 def pressed() -> tuple[FastFlight, FastResult]:
     wall = {"tilt_error_deg": [12.0, -6.0], "place_error_m": -0.03, "friction": 0.12}
-    return press(wall, face_m=0.2)
+    return press(wall, approach_m_s=0.08, face_m=0.15, until=contact_over())
 
 
 def test_the_force_is_held_on_a_slippery_tilted_wall_that_is_not_where_the_mission_expects_it(
     pressed: tuple[FastFlight, FastResult],
 ) -> None:
     flight, result = pressed
-    assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed
+    assert result.outputs[-1].outcome is None and not result.crashed
     assert not {"contact_lost", "contact_bounce", "surface_missing", "tether_snagged", "catch"} & set(events(result))
     steady = np.array([o.contact is not None and o.contact.wanted_n == 5.0 for o in result.outputs])
     settled = np.flatnonzero(steady)[300:]
@@ -119,7 +119,7 @@ def test_after_the_contact_nothing_presses_and_the_vehicle_is_back_on_its_plan(
     assert result.outputs[last].contact.mode is ContactMode.RETURN  # type: ignore[union-attr]
     after = result.outputs[last + 1].reference
     assert after is not None and after.push_world_n is None
-    assert after.position_world_m == pytest.approx((0.66, 0.0, 0.7), abs=1e-3)
+    assert after.position_world_m == pytest.approx((0.7, 0.0, 0.7), abs=1e-3)
     assert force_n(result)[last + 1 :].max() == 0.0
 
 
@@ -152,19 +152,16 @@ def test_a_replay_is_identical_and_a_tip_that_presses_beside_its_point_is_report
     pressed: tuple[FastFlight, FastResult],
 ) -> None:
     flight, result = pressed
-    core, aside = FlightCore(flight.config.flight), None
+    core = FlightCore(flight.config.flight)
     reached = next(k for k, o in enumerate(result.outputs) if o.contact is not None and o.contact.wanted_n == 5.0)
-    for k, (inputs, outputs) in enumerate(zip(result.inputs, result.outputs, strict=True)):
-        if k == reached - 3:
-            aside = copy.deepcopy(core)
+    for inputs, outputs in zip(result.inputs[: reached - 3], result.outputs, strict=False):
         assert core.step(inputs) == outputs
-    assert aside is not None
     seen: list[str] = []
     for inputs in result.inputs[reached - 3 : reached + 3]:
         assert inputs.arm is not None
         first, *others = inputs.arm.angle_rad
         moved = replace(inputs, arm=replace(inputs.arm, angle_rad=(first + 0.15, *others)))
-        seen += [event.text for event in aside.step(moved).events if event.id == "contact_beside"]
+        seen += [event.text for event in core.step(moved).events if event.id == "contact_beside"]
     assert len(seen) == 1 and seen[0].endswith("cm beside the point of the mission (limit 5 cm)")
 
 
@@ -210,10 +207,10 @@ def test_a_force_sensor_that_dies_during_the_press_leads_away_from_the_wall() ->
     faults = "world.faults=[{kind: force_loss, t_s: 11.0}]"
     config = load_sitl("press", world="wall", overrides=[faults, "mission.phases[3].face_m=null", *SHORT])
     flight = FastFlight(config)
-    result = flight.run(90.0)
+    result = flown_until(flight, after("contact_lost", 2.5))
     contact = flight.plant.machine.contact
     assert "contact_lost" in events(result) and "tether_snagged" not in events(result)
-    assert result.outputs[-1].outcome is Outcome.ABORTED and not result.crashed
+    assert not result.crashed and force_n(result)[-100:].max() == 0.0
     assert contact is not None and contact.force_max_n < 7.5 and contact.rotor_distance_min_m > 0.15
 
 
@@ -222,7 +219,7 @@ def test_a_force_sensor_whose_zero_shifts_during_the_approach_neither_pushes_int
     # A shift by 3 N also looks like a tether that pulls: whether that is noticed first would be luck.
     sets = [faults, "vehicle.tether=null", "mission.phases[3].face_m=null", *SHORT]
     flight = FastFlight(load_sitl("press", world="wall", overrides=sets))
-    result = flight.run(until=after("contact_lost", 4.0))
+    result = flown_until(flight, after("contact_lost", 4.0))
     contact = flight.plant.machine.contact
     assert "contact_lost" in events(result) and not result.crashed and force_n(result)[-200:].max() == 0.0
     assert contact is not None and contact.force_max_n < 7.5 and contact.rotor_distance_min_m > 0.15
@@ -247,7 +244,7 @@ def test_a_surface_that_gives_way_is_not_followed() -> None:
 
 @pytest.mark.parametrize("command", [OperatorCommand.HOLD, OperatorCommand.LAND])
 def test_a_command_while_pressing_leads_away_from_the_wall_first(command: OperatorCommand) -> None:
-    _, result = press(command=(2.0, command), until=after(f"operator_{command.value}", 4.0))
+    _, result = press(command=(1.6, command), until=after(f"operator_{command.value}", 2.5))
     assert not result.crashed
     since_s = next(o.t_s for o in result.outputs for e in o.events if e.id == f"operator_{command.value}")
     pressing = force_n(result)[[o.t_s > since_s + 1.0 for o in result.outputs]]

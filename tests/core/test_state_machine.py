@@ -21,6 +21,7 @@ from companion.model.outputs import Outputs
 from companion.model.types import Event, Outcome
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
+from tests.flights.ends import flown_until
 from tests.support import SHORT_CATCH
 
 
@@ -70,7 +71,7 @@ def test_a_transition_done_twice_gives_the_same_and_leaves_its_arguments_alone(m
         ticks += 1
         stages.add(state.stage)
         observations.append(observation)
-        before = plain(state) if ticks % 60 == 0 else None
+        before = plain(state) if ticks % 120 == 0 else None
         first = transition(parameters, state, events, observation)
         if before is not None:
             assert plain(transition(parameters, state, events, observation)[0]) == plain(first[0])
@@ -79,7 +80,10 @@ def test_a_transition_done_twice_gives_the_same_and_leaves_its_arguments_alone(m
 
     monkeypatch.setattr(flight_core, "transition", twice)
     landing = ("world.faults=[{kind: mocap_loss, phase: line}]",)
-    outputs = [FastFlight(load_sitl(SHORT_CATCH, overrides=overrides)).run().outputs for overrides in ((), landing)]
+    outputs = [
+        flown_until(FastFlight(load_sitl(SHORT_CATCH, overrides=overrides)), lambda o: o.outcome is not None).outputs
+        for overrides in ((), landing)
+    ]
     assert [flown[-1].outcome for flown in outputs] == [Outcome.COMPLETED, Outcome.ABORTED]
     assert_observes_the_tick_before(outputs[0], observations)
     assert stages >= {

@@ -20,6 +20,7 @@ from companion.model.outputs import Outputs
 from companion.model.types import FlightMode, Inputs, OperatorCommand, Outcome, SafetyAction
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
+from tests.flights.ends import flown_until
 from tests.flights.test_ladder_flights import TAUT
 from tests.safety.healthy import put
 from tests.support import HOVER, LOW_HOVER
@@ -76,7 +77,7 @@ def commanded(
     until_s: float = 60.0,
 ) -> Commanded:
     flight = _Asking(script, change, *sets)
-    result = flight.run(limit_s=until_s)
+    result = flown_until(flight, lambda o: o.t_s >= until_s or o.outcome is not None)
     assert not result.crashed
     flown = Commanded(result.inputs, result.outputs, flight)
     for k, i in enumerate(result.inputs):
@@ -197,15 +198,15 @@ def test_too_low_to_hold_and_in_the_missions_own_landing() -> None:
 
 def test_nothing_is_done_against_a_pilot() -> None:
     def change(i: Inputs) -> Inputs:
-        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 7.0 else i
+        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 6.0 else i
 
-    flown = commanded((7.5, HOLD), (7.6, RESUME), (7.7, LAND), (7.8, ABORT), (7.9, START), change=change, until_s=9.0)
+    flown = commanded((6.2, HOLD), (6.3, RESUME), (6.4, LAND), (6.5, ABORT), (6.6, START), change=change, until_s=6.7)
     assert flown.effects == [
         (False, f"{name} refused: a pilot has control; nothing is sent")
         for name in ("hold", "resume", "land", "abort", "start")
     ]
-    assert flown.at(7.5).phase == "a pilot flies"
-    assert all(o.attitude is None for o in flown.outputs if o.t_s > 7.1)
+    assert flown.at(6.2).phase == "a pilot flies"
+    assert all(o.attitude is None for o in flown.outputs if o.t_s > 6.1)
 
 
 def test_commands_while_px4_lands_on_its_own() -> None:
@@ -271,10 +272,10 @@ def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
 
 
 def test_it_waits_for_start_with_nothing_sent_and_then_flies() -> None:
-    flown = commanded((2.5, HOLD), (5.0, START), sets=(*WAITS, *LOW))
+    flown = commanded((2.0, HOLD), (3.0, START), sets=(*WAITS, *LOW))
     assert flown.effects == [(True, "the vehicle stays on the ground until start is commanded"), (True, "taking off")]
     waiting = [o for o in flown.outputs if o.phase == "waits for start"]
-    assert waiting[-1].t_s - waiting[0].t_s > 2.0
+    assert waiting[-1].t_s - waiting[0].t_s > 1.0
     assert all(o.attitude is None and o.arm_torque_nm is None and o.request.value == "none" for o in waiting)
     assert flown.outcome is Outcome.COMPLETED
     assert [id_ for id_ in flown.ids if id_ != "catch"] == ["operator_start", "takeoff", "touchdown"]
@@ -282,44 +283,44 @@ def test_it_waits_for_start_with_nothing_sent_and_then_flies() -> None:
 
 @pytest.mark.parametrize("command", [LAND, ABORT])
 def test_it_waits_for_start_and_stands_down_on_command(command: OperatorCommand) -> None:
-    flown = commanded((5.0, command), sets=WAITS)
+    flown = commanded((2.5, command), sets=WAITS)
     assert flown.effects == [(True, "not taking off: the start is cancelled")]
     assert flown.outcome is Outcome.ABORTED
-    assert flown.outputs[-1].t_s < 5.1
+    assert flown.outputs[-1].t_s < 2.6
 
 
 def test_what_is_lost_while_it_waits_is_reported_and_may_come_back_at_any_time() -> None:
     """It is carried half a metre away and back."""
-    change = off_its_way(4.0, 8.0, 0.5)
-    flown = commanded((6.0, START), (11.0, START), change=change, sets=(*WAITS, *FORGIVING, *LOW), until_s=15.5)
+    change = off_its_way(3.0, 5.0, 0.5)
+    flown = commanded((4.5, START), (8.0, START), change=change, sets=(*WAITS, *FORGIVING, *LOW), until_s=12.5)
     assert flown.effects[0][0] is False
     assert "start refused: mission 'hover': starts at" in flown.effects[0][1]
     assert flown.effects[1] == (True, "taking off")
     assert [id_ for id_ in flown.ids if id_.startswith("operator_") or "ready" in id_ or "declined" in id_] == [
         *("not_ready", "operator_start", "start_declined", "operator_start"),
     ]
-    assert flown.at(7.0).phase == "wait"
-    assert flown.at(10.5).phase == "waits for start" and "takeoff" in flown.ids
+    assert flown.at(4.8).phase == "wait"
+    assert flown.at(7.8).phase == "waits for start" and "takeoff" in flown.ids
 
 
 def test_an_estimate_that_wanders_off_while_it_waits_is_reported() -> None:
     def change(i: Inputs) -> Inputs:
-        if i.vehicle is None or not 5.0 <= i.t_s < 8.0:
+        if i.vehicle is None or not 3.0 <= i.t_s < 5.0:
             return i
         x, y, z = i.vehicle.position_world_m
         return put("vehicle", position_world_m=(x + 0.07, y, z))(i)
 
-    flown = commanded((7.0, START), (11.0, START), change=change, sets=WAITS, until_s=11.5)
+    flown = commanded((4.8, START), (8.0, START), change=change, sets=WAITS, until_s=8.2)
     assert flown.effects[0][0] is False
     assert flown.effects[0][1].startswith("start refused: PX4's estimate has not settled")
     assert flown.effects[1] == (True, "taking off")
 
 
 def test_a_start_that_comes_before_it_is_ready_is_refused_and_not_remembered() -> None:
-    flown = commanded((0.7, START), (5.0, START), (5.5, START), sets=WAITS, until_s=6.0)
+    flown = commanded((0.7, START), (3.0, START), (3.5, START), sets=WAITS, until_s=3.6)
     assert flown.effects[0][0] is False
     assert flown.effects[0][1].startswith("start refused: ")
-    assert flown.at(4.0).phase == "waits for start"
+    assert flown.at(2.9).phase == "waits for start"
     assert flown.effects[1:] == [(True, "taking off"), (True, "already taking off")]
 
 
@@ -329,11 +330,11 @@ def test_the_net_is_weighed_right_before_the_start() -> None:
     def change(i: Inputs) -> Inputs:
         if i.force is None:
             return i
-        drift_n = 2.0 * min(1.0, i.t_s / 5.0)
+        drift_n = 2.0 * min(1.0, i.t_s / 3.0)
         x, y, z = i.force.force_sensor_n
         return put("force", force_sensor_n=(x + drift_n, y, z))(i)
 
-    flown = commanded((7.0, START), change=change, sets=(*WAITS, *LOW), until_s=13.0)
+    flown = commanded((4.5, START), change=change, sets=(*WAITS, *LOW), until_s=10.5)
     felt = [o.control.force_ext_world_n for o in flown.outputs if o.control is not None and o.phase == "hold"]
     assert felt
     assert max(math.hypot(*force_n) for force_n in felt) < 0.6
@@ -341,7 +342,7 @@ def test_the_net_is_weighed_right_before_the_start() -> None:
 
 def test_the_plan_begins_where_it_stands_at_the_start() -> None:
     """It was pushed 5 cm aside while it waited: within the tolerance, so it goes up from there."""
-    flown = commanded((6.0, START), change=off_its_way(3.0, 8.0, 0.05), sets=(*WAITS, *FORGIVING), until_s=8.0)
+    flown = commanded((4.5, START), change=off_its_way(2.5, 9.0, 0.05), sets=(*WAITS, *FORGIVING), until_s=8.0)
     spooled = next(o for o in flown.outputs if o.phase == "spool up" and o.reference is not None)
     at_start = next(i for i in flown.inputs if i.command is START)
     assert spooled.reference is not None and at_start.vehicle is not None
@@ -350,7 +351,7 @@ def test_the_plan_begins_where_it_stands_at_the_start() -> None:
 
 def test_a_finding_of_the_ground_refuses_it_while_it_waits() -> None:
     def change(i: Inputs) -> Inputs:
-        return put("status", battery_remaining=0.1)(i) if i.t_s > 5.0 else i
+        return put("status", battery_remaining=0.1)(i) if i.t_s > 2.5 else i
 
     flown = commanded(change=change, sets=WAITS)
     assert flown.ids == ["battery_warn", "battery_low"] or flown.ids == ["battery_low", "battery_warn"]
@@ -359,7 +360,7 @@ def test_a_finding_of_the_ground_refuses_it_while_it_waits() -> None:
 
 def test_armed_by_somebody_else_while_it_waits_it_is_not_flown() -> None:
     def change(i: Inputs) -> Inputs:
-        return put("status", armed=True, mode=FlightMode.OFFBOARD)(i) if 5.0 < i.t_s < 6.0 else i
+        return put("status", armed=True, mode=FlightMode.OFFBOARD)(i) if 2.5 < i.t_s < 3.5 else i
 
     flown = commanded(change=change, sets=WAITS)
     assert flown.ids == ["armed_externally"]

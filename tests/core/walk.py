@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections import deque
+from collections import Counter, deque
 from functools import cache
 
 import msgspec
@@ -28,6 +28,7 @@ from companion.model.types import (
 )
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
 from tests.support import HOVER
 
 STEP_S = 0.02
@@ -38,6 +39,8 @@ ON_ITS_BACK = quat_from_euler_zyx(math.radians(178.0), 0.0, 0.0)
 ON_ITS_ROTORS = quat_from_euler_zyx(math.radians(-55.0), 0.0, 0.0)
 """Tipped over: it rests on two feet and a rotor."""
 STOPS = (AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM)
+TICKS = (0, 1, 20, 100)
+"""Numbers of ticks in a phase after which `begun` has the flight."""
 LOW_HOVER = ("mission.phases[0].height_m=0.5", "mission.phases[0].duration_s=2.0", "mission.phases[1].duration_s=1.0")
 replace = msgspec.structs.replace
 
@@ -53,7 +56,7 @@ class Deaf:
 
 @dataclasses.dataclass(frozen=True)
 class Begun:
-    """A recorded flight up to some phase, and a core that has flown it."""
+    """Inputs of a flight in some phase, and a core that has just stepped with them."""
 
     core: FlightCore
     inputs: Inputs
@@ -64,23 +67,22 @@ class Begun:
 
 
 @cache
-def _recorded() -> tuple[FastFlight, list[Inputs]]:
-    flight = FastFlight(load_sitl(HOVER, overrides=LOW_HOVER))
+def _begun() -> dict[tuple[str, int], Begun]:
+    """Return a low hover flight, PX4's land detector deaf, some ticks into each of its phases."""
+    flight, found, ticks = FastFlight(load_sitl(HOVER, overrides=LOW_HOVER)), {}, Counter[str]()
     flight.px4.land = Deaf()  # type: ignore[assignment]
-    return flight, flight.run().inputs
+    result = FastResult()
+    for o in flight.ticks(result):
+        if ticks[o.phase] in TICKS:
+            standing_m = flight.config.vehicle.airframe.ground_clearance_m
+            found[o.phase, ticks[o.phase]] = Begun(copy.deepcopy(flight.core), result.inputs[-1], standing_m)
+        ticks[o.phase] += 1
+    return found
 
 
-@cache
-def begun(phase: str, ticks: int = 40) -> Begun:
-    """A low hover flight, PX4's land detector deaf, up to `ticks` ticks into a phase."""
-    flight, inputs = _recorded()
-    core = FlightCore(flight.config)
-    left = ticks
-    for i in inputs:
-        left -= core.step(i).phase == phase
-        if left < 0:
-            return Begun(core, i, flight.config.vehicle.airframe.ground_clearance_m)
-    raise AssertionError(f"the flight never was in {phase!r} for {ticks} ticks")
+def begun(phase: str, ticks: int) -> Begun:
+    """Return a low hover flight, PX4's land detector deaf, after so many ticks in a phase."""
+    return _begun()[phase, ticks]
 
 
 @dataclasses.dataclass

@@ -6,6 +6,18 @@ import math
 from collections.abc import Callable
 
 from companion.model.outputs import Outputs
+from sitl.fast.loop import FastFlight
+from sitl.fast.result import FastResult
+
+
+def flown_until(flight: FastFlight, until: Callable[[Outputs], bool]) -> FastResult:
+    """Fly until `until` returns True; PX4 does not finish a landing then, as it does after `FastFlight.run` with faults."""
+    result = FastResult()
+    for outputs in flight.ticks(result):
+        if until(outputs):
+            break
+    result.crashed, result.caught = flight.plant.machine.crashed, flight.plant.scene.payload.caught_t_s is not None
+    return result
 
 
 def after(event_id: str, seconds: float = 0.0) -> Callable[[Outputs], bool]:

@@ -354,7 +354,7 @@ def test_a_ball_at_the_rotors_makes_the_vehicle_stay() -> None:
 def test_no_ball_crosses_the_rotor_disks_of_a_vehicle_that_moves_to_meet_it() -> None:
     air, airframe = Tick(0.0, None, True, []), CONFIG.vehicle.airframe
     state, changed = PHASE.begin(air), 0
-    for path, _, _ in throws(400, 6):
+    for path, _, _ in throws(150, 6):
         best = next(meetings(0.0, state.now, state.lag, path, NET_M, OPENING, BOUNDS, REACH, None), None)
         plan = PHASE._meeting(air, state, path, None)
         changed += plan != best
