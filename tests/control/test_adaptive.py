@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from functools import partial
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
-from companion.control.adaptive import Adaptation, AdaptiveController, rows_of
+from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.types import PlantState, Wrench
 from companion.mission.reference import at_rest
 from companion.model.types import IDENTITY_QUAT, Joints
@@ -48,31 +47,6 @@ def test_at_rest_on_the_reference_it_asks_for_hover_and_arm_gravity(config: Flig
     assert wrench.log.saturated == (False, False, False)
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_it_pushes_against_the_position_error(config: FlightConfig, axis: int) -> None:
-    off = [0.0, 0.0, 1.0]
-    off[axis] += 0.1
-    tau = settled(config, state(position=(off[0], off[1], off[2])), 1).log.tau
-    rest = (0.0, 0.0, config.vehicle.airframe.mass_kg * 9.81)
-    # At least the free-motion stiffness Lambda Phi.
-    stiffness = law(config).lambda_gain[axis] * law(config).phi[axis]
-    assert tau[axis] - rest[axis] <= -0.1 * stiffness * 0.999
-
-
-@pytest.mark.parametrize("joint", [0, 1])
-def test_it_pushes_joints_back_and_respects_their_limit(config: FlightConfig, joint: int) -> None:
-    rest = settled(config, state(), 1).arm_torque_nm
-    off = list(FOLD)
-    off[joint] += 0.2
-    pushed = settled(config, state(arm=(off[0], off[1])), 1).arm_torque_nm
-    assert pushed[joint] < rest[joint]
-    far = [FOLD[0], FOLD[1]]
-    far[joint] -= 3.0
-    limit = config.vehicle.arm.joints[joint].torque_max_nm
-    wrench = settled(config, state(arm=(far[0], far[1])), 50)
-    assert abs(wrench.arm_torque_nm[joint]) <= limit
-
-
 def test_a_payload_is_carried_after_a_while() -> None:
     """recommended: the measured pull of 2 N goes into the vertical force; the arm's desired force follows it."""
     config = load_flight("configs/missions/catch.yaml", preset="recommended")
@@ -98,18 +72,3 @@ def test_adaptive_gains_stay_nonnegative_for_any_input(
         adaptation.advance(dt_s, norm_s, regressor, frozen)
         assert min(adaptation.H) >= 0.0
         assert adaptation.zeta >= 0.0
-
-
-def test_gamma_is_the_exact_solution(config: FlightConfig) -> None:
-    """M_d gamma' = e_tau - D gamma for a held e_tau, against a fine Euler integration."""
-    rows = rows_of(law(config), 2)
-    e_tau = [0.3, -0.2, 1.0, 0.0, 0.0, 0.0, 0.5, -0.4]
-    for _ in range(20):
-        for row, held in zip(rows, e_tau, strict=True):
-            row.e_tau = held
-            row.advance(0.005)
-    gamma = np.zeros(8)
-    m_d, d = np.array([row.M_d for row in rows]), np.array([row.D for row in rows])
-    for _ in range(100_000):
-        gamma += 1e-6 * (e_tau - d * gamma) / m_d
-    np.testing.assert_allclose([row.gamma for row in rows], gamma, rtol=1e-3, atol=1e-9)

@@ -37,8 +37,8 @@ def law(config: SitlConfig) -> CscConfig:
 
 
 def flown(*overrides: str) -> FastResult:
-    """The mission to the end of `stabilise`, 4.5 s after the catch."""
-    return FastFlight(configured(*overrides)).run(until_mission_s=11.0)
+    """The mission up to 3 s after the catch."""
+    return FastFlight(configured(*overrides)).run(until_mission_s=9.5)
 
 
 def stepped(config: SitlConfig, state: PlantState, acceleration: Vec3 = ZERO, vertical_scale: float = 1.0) -> Wrench:

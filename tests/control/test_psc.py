@@ -44,8 +44,8 @@ def controller(config: SitlConfig) -> PscController:
 
 
 def flown(*overrides: str) -> FastResult:
-    """The mission to the end of `stabilise`, 4.5 s after the catch."""
-    return FastFlight(configured(*overrides)).run(until_mission_s=11.0)
+    """The mission up to 3.5 s after the catch."""
+    return FastFlight(configured(*overrides)).run(until_mission_s=10.0)
 
 
 REFERENCE = replace(

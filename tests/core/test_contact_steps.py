@@ -11,14 +11,12 @@ from msgspec.structs import replace
 from companion.config.loader import load_flight
 from companion.core.flight_state import FlightState, Request
 from companion.core.transition import Parameters
-from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.plan import Plan
 from companion.model.contact import ContactMode, ContactState, TouchedPoint
-from companion.model.flight_stage import Stage
 from companion.model.types import Inputs, Outcome, Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact.base import opening_of
-from tests.core.test_reactions import ids, tick
+from tests.core.test_reactions import ids, in_plan, tick
 from tests.safety.healthy import healthy, put
 
 CONFIG = load_flight("configs/missions/press.yaml", overrides=["mission.phases[3].face_m=null"])
@@ -39,17 +37,7 @@ def contact(mode: ContactMode, since_s: float = 0.0, **fields: Any) -> ContactSt
 
 
 def at_plan(plan_s: float, now: ContactState | None, segment: Any = APPROACH, **fields: Any) -> FlightState:
-    state = replace(
-        P.initial_state(),
-        stage=Stage.MISSION,
-        entered_s=NOW_S - plan_s,
-        plan=PLAN,
-        course=ActiveTrajectory(PLAN, NOW_S - plan_s),
-        mission_start_s=NOW_S - plan_s,
-        own=now,
-        engaged=None if now is None else segment,
-    )
-    return replace(state, **fields)
+    return in_plan(plan_s, PLAN, P, own=now, engaged=None if now is None else segment, **fields)
 
 
 def step(state: FlightState, force_n: float = 0.0, **observed: Any) -> tuple[FlightState, Request]:

@@ -12,19 +12,17 @@ from companion.model.types import (
     FlightMode,
     Inputs,
     LandedState,
-    MocapPose,
     Outcome,
     PhaseKind,
     SafetyAction,
     Vec3,
-    VehicleState,
 )
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from sitl.mocap import MocapFrame
-from tests.safety.healthy import healthy, put
+from tests.safety.healthy import put
 from tests.support import HOVER, SHORT_CATCH
 
 replace = msgspec.structs.replace
@@ -165,53 +163,3 @@ def test_estimate_frozen_just_above_the_floor_is_no_touchdown() -> None:
     flight, result = flown(change)
     assert rotors_stopped_at_m(result) < STANDS_M + 0.02
     assert not flight.px4.armed and not result.crashed
-
-
-def test_nobody_takes_thrust_back_from_what_sinks() -> None:
-    """The detector alone: height stands by itself, thrust is taken back, the poses sink, all of it is given again."""
-    from companion.safety.touchdown import Touchdown
-
-    detector, z, reliefs = Touchdown.begin(0.3), 0.5, []
-    vehicle = healthy().vehicle
-    assert isinstance(vehicle, VehicleState)
-    frozen = replace(vehicle, position_world_m=(0.0, 0.0, 0.4), velocity_world_m_s=(0.0, 0.0, 0.0))
-    sink_m_s = 0.0
-    for k in range(600):
-        t_s = 1.0 + 0.005 * k
-        sink_m_s = max(0.0, sink_m_s + 0.005 * 9.81 * (1.0 - detector.relief) - 0.01 * (detector.relief == 1.0))
-        z -= 0.005 * sink_m_s
-        pose = MocapPose(
-            stamp_s=t_s,
-            frame_number=k,
-            position_world_m=(0.0, 0.0, z),
-            attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
-            tracking_valid=True,
-            marker_error_m=0.0,
-        )
-        detector = detector.update(t_s, frozen, pose, 0.2, 0.9, landed=False)
-        assert not detector.certain
-        reliefs.append(detector.relief)
-    assert 0.6 < min(reliefs) < 1.0
-
-
-def test_hanging_on_the_tether_is_no_touchdown() -> None:
-    """Thrust next to nothing, nothing sinks, PX4's detector agrees: and it is a metre up."""
-    from companion.safety.touchdown import Touchdown
-
-    detector = Touchdown.begin(0.3)
-    vehicle = healthy().vehicle
-    assert isinstance(vehicle, VehicleState)
-    hangs = replace(vehicle, position_world_m=(0.0, 0.0, 1.2), velocity_world_m_s=(0.0, 0.0, 0.0))
-    for k in range(1000):
-        t_s = 1.0 + 0.005 * k
-        pose = MocapPose(
-            stamp_s=t_s,
-            frame_number=k,
-            position_world_m=(0.0, 0.0, 1.2),
-            attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
-            tracking_valid=True,
-            marker_error_m=0.0,
-        )
-        detector = detector.update(t_s, hangs, pose, 0.0, 0.1, landed=True)
-        assert not detector.certain
-        assert detector.relief == 1.0

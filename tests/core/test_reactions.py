@@ -45,18 +45,11 @@ HERE: Vec3 = (0.0, 0.3, 1.0)
 """The anchor lies towards -y."""
 
 
-def in_plan(plan_s: float = 6.0) -> FlightState:
-    """In the air, some time into the mission."""
-    now_s = healthy().t_s
-    course = ActiveTrajectory(PLAN, now_s - plan_s)
-    return replace(
-        P.initial_state(),
-        stage=Stage.MISSION,
-        entered_s=now_s - plan_s,
-        plan=PLAN,
-        course=course,
-        mission_start_s=now_s - plan_s,
-    )
+def in_plan(plan_s: float = 6.0, plan: Plan = PLAN, parameters: Parameters = P, **fields: Any) -> FlightState:
+    """In the air, some time into the mission; `fields` of the state have other values."""
+    begun_s = healthy().t_s - plan_s
+    times = {"entered_s": begun_s, "course": ActiveTrajectory(plan, begun_s), "mission_start_s": begun_s}
+    return replace(parameters.initial_state(), **({"stage": Stage.MISSION, "plan": plan} | times | fields))
 
 
 def tick(

@@ -13,25 +13,8 @@ from hypothesis import strategies as st
 from companion.core.flight_core import FlightCore
 from companion.flight.heartbeat import Heartbeats
 from companion.model.outputs import Outputs
-from companion.model.types import (
-    AutopilotRequest,
-    FlightMode,
-    LandedState,
-    LinkIdentity,
-    OperatorCommand,
-    Outcome,
-)
-from tests.core.walk import (
-    ON_ITS_BACK,
-    ON_ITS_ROTORS,
-    STEP_S,
-    STOPS,
-    UPRIGHT,
-    Account,
-    Machine,
-    begun,
-    walked,
-)
+from companion.model.types import AutopilotRequest, FlightMode, LandedState, LinkIdentity, OperatorCommand, Outcome
+from tests.core.walk import ON_ITS_BACK, ON_ITS_ROTORS, STEP_S, STOPS, UPRIGHT, Account, Machine, begun, walked
 
 PHASES = ("wait", "arm", "spool up", "hold", "land", "touchdown", "disarm")
 """Where the made-up inputs begin."""

@@ -12,16 +12,14 @@ from companion.config.loader import load_flight
 from companion.core.flight_core import within_friction
 from companion.core.flight_state import FlightState, Request
 from companion.core.transition import Parameters
-from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.plan import Plan
 from companion.model.contact import ContactMode, ContactState
-from companion.model.flight_stage import Stage
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import Inputs, Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact import sliding
 from companion.phases.contact.slide import Slide
-from tests.core.test_reactions import ids, tick
+from tests.core.test_reactions import ids, in_plan, tick
 from tests.safety.healthy import healthy, put
 
 CONFIG = load_flight("configs/missions/slide.yaml", overrides=["mission.phases[3].face_m=null"])
@@ -55,16 +53,7 @@ def step(
     contact: ContactState, off_m: Vec3 = (0.0, 0.0, 0.0), force_n: float = 3.0, **observed: Any
 ) -> tuple[ContactState, FlightState, Request]:
     plan_s = SLIDE.start_s + 2.0
-    state = replace(
-        P.initial_state(),
-        stage=Stage.MISSION,
-        entered_s=NOW_S - plan_s,
-        plan=PLAN,
-        course=ActiveTrajectory(PLAN, NOW_S - plan_s),
-        mission_start_s=NOW_S - plan_s,
-        own=contact,
-        engaged=SLIDE,
-    )
+    state = in_plan(plan_s, PLAN, P, own=contact, engaged=SLIDE)
     given = {"inputs": seen(off_m, plan_s), "dt_s": DT_S, "force_world_n": (-force_n, 0.0, 0.0), **observed}
     after, request = tick(state, parameters=P, **given)
     assert after.expected.contact is not None

@@ -153,7 +153,7 @@ def test_a_hold_that_nobody_may_end_yet() -> None:
         assert text.endswith("m off the reference (limit 0.60 m)")
     assert flown.effects[2] == (True, "continuing")
     assert [id_ for id_ in flown.ids if id_ in ("tracking_hold", "resume_refused")] == [
-        *("tracking_hold", "resume_refused", "resume_refused"),
+        *("tracking_hold", "resume_refused", "resume_refused")
     ]
     assert {flown.at(t_s).action for t_s in (7.52, 8.02)} == {SafetyAction.HOLD}
     assert flown.at(8.72).action is SafetyAction.NOMINAL
@@ -297,7 +297,7 @@ def test_what_is_lost_while_it_waits_is_reported_and_may_come_back_at_any_time()
     assert "start refused: mission 'hover': starts at" in flown.effects[0][1]
     assert flown.effects[1] == (True, "taking off")
     assert [id_ for id_ in flown.ids if id_.startswith("operator_") or "ready" in id_ or "declined" in id_] == [
-        *("not_ready", "operator_start", "start_declined", "operator_start"),
+        *("not_ready", "operator_start", "start_declined", "operator_start")
     ]
     assert flown.at(4.8).phase == "wait"
     assert flown.at(7.8).phase == "waits for start" and "takeoff" in flown.ids

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import selectors
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Callable, Coroutine, Iterable
+from typing import Any, TypeVar
 
 import pytest
 from hypothesis import given
@@ -16,6 +17,7 @@ from companion.flight.ticker import EARLY_S, LATE_S, Ticker, TickTime
 
 P = 0.005
 RATE_HZ = 1.0 / P
+T = TypeVar("T")
 
 
 class SimulatedTime(selectors.SelectSelector):
@@ -29,6 +31,14 @@ class SimulatedTime(selectors.SelectSelector):
         return super().select(0.0)
 
 
+def simulated(run: Callable[[asyncio.AbstractEventLoop, SimulatedTime], Coroutine[Any, Any, T]]) -> T:
+    """Run a coroutine in an event loop on simulated time."""
+    time = SimulatedTime()
+    with contextlib.closing(asyncio.SelectorEventLoop(time)) as loop:
+        loop.time = lambda: time.now_s  # type: ignore[method-assign]
+        return loop.run_until_complete(run(loop, time))
+
+
 def ticks_of(
     frames_s: Iterable[float],
     until_s: float,
@@ -36,11 +46,8 @@ def ticks_of(
     work: Callable[[int, SimulatedTime], None] = lambda tick, time: None,
 ) -> tuple[list[TickTime], Ticker]:
     """Ticks from 0 to `until_s` of a loop to which frames arrive at those times; `work` is done in each."""
-    time = SimulatedTime()
-    loop = asyncio.SelectorEventLoop(time)
-    loop.time = lambda: time.now_s  # type: ignore[method-assign]
 
-    async def run() -> tuple[list[TickTime], Ticker]:
+    async def run(loop: asyncio.AbstractEventLoop, time: SimulatedTime) -> tuple[list[TickTime], Ticker]:
         ticker = Ticker(P, lambda: time.now_s, rate_hz)
         for frame_s in frames_s:
             loop.call_at(frame_s, ticker.frame, frame_s)
@@ -50,10 +57,7 @@ def ticks_of(
             work(len(ticks), time)
         return ticks, ticker
 
-    try:
-        return loop.run_until_complete(run())
-    finally:
-        loop.close()
+    return simulated(run)
 
 
 def starts_of(ticks: list[TickTime]) -> list[float]:
@@ -137,11 +141,7 @@ def test_a_stall_is_reported_and_not_made_up_for(frames: bool) -> None:
 
 
 def test_a_stall_while_it_waits_is_lateness() -> None:
-    time = SimulatedTime()
-    loop = asyncio.SelectorEventLoop(time)
-    loop.time = lambda: time.now_s  # type: ignore[method-assign]
-
-    async def run() -> TickTime:
+    async def run(loop: asyncio.AbstractEventLoop, time: SimulatedTime) -> TickTime:
         ticker = Ticker(P, lambda: time.now_s, RATE_HZ)
         for n in range(1, 100):
             loop.call_at(n * P, ticker.frame, n * P)
@@ -155,17 +155,11 @@ def test_a_stall_while_it_waits_is_lateness() -> None:
         loop.call_later(0.002, held_up)
         return await ticker.next()
 
-    late = loop.run_until_complete(run())
-    loop.close()
-    assert late.lateness_s == pytest.approx(0.0142, abs=0.0011)
+    assert simulated(run).lateness_s == pytest.approx(0.0142, abs=0.0011)
 
 
 def test_when_the_next_tick_is_due_is_known_before() -> None:
-    time = SimulatedTime()
-    loop = asyncio.SelectorEventLoop(time)
-    loop.time = lambda: time.now_s  # type: ignore[method-assign]
-
-    async def run() -> list[float]:
+    async def run(loop: asyncio.AbstractEventLoop, time: SimulatedTime) -> list[float]:
         ticker = Ticker(P, lambda: time.now_s, RATE_HZ)
         for n in range(1, 100):
             loop.call_at(n * P + 0.001, ticker.frame, n * P + 0.001)
@@ -175,6 +169,4 @@ def test_when_the_next_tick_is_due_is_known_before() -> None:
             leads_s.append((await ticker.next()).start_s - due_s)
         return leads_s
 
-    leads_s = loop.run_until_complete(run())
-    loop.close()
-    assert leads_s[-20:] == pytest.approx([0.0] * 20, abs=2e-5)
+    assert simulated(run)[-20:] == pytest.approx([0.0] * 20, abs=2e-5)

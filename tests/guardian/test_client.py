@@ -32,9 +32,11 @@ from companion.model.types import (
     Severity,
 )
 from companion.phases.contact import force as contact
+from tests.guardian.landing_rig import beat
 from tests.support import HOVER
 
 Pair = tuple[GuardianClient, socket.socket]
+LINK = LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=14540, peer=("10.0.0.7", 14580))
 
 
 class Clock:
@@ -102,7 +104,7 @@ def test_a_dead_guardian_is_noticed_and_costs_nothing(pair: Pair) -> None:
     guardian.close()
     client.listen()
     assert not client.ready
-    client.send_heartbeat(_beat())
+    client.send_heartbeat(beat())
     with pytest.raises(DeviceError, match="its process ended"):
         asyncio.run(client.wait_ready())
 
@@ -110,36 +112,12 @@ def test_a_dead_guardian_is_noticed_and_costs_nothing(pair: Pair) -> None:
 def test_a_guardian_that_does_not_read_never_blocks_the_flight(pair: Pair) -> None:
     client, guardian = pair
     for _ in range(20_000):  # far beyond what the socket holds
-        client.send_heartbeat(_beat())
-    assert heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) == _beat()
-
-
-def _beat() -> heartbeat.Heartbeat:
-    return heartbeat.Heartbeat(
-        tick=1,
-        t_s=2.0,
-        origin_s=3.0,
-        mission_t_s=0.0,
-        lifting=True,
-        pilot=False,
-        goodbye=False,
-        mocap_refused=False,
-        autopilot_system=1,
-        own_system=1,
-        own_component=195,
-        local_port=14540,
-        pose_stamp_s=1.9,
-        position_world_m=(0.0, 0.0, 1.0),
-    )
+        client.send_heartbeat(beat())
+    assert heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) == beat()
 
 
 def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
-    status = AutopilotStatus(
-        heartbeat_stamp_s=5.0,
-        armed=armed,
-        mode=FlightMode.OFFBOARD,
-        landed=LandedState.IN_AIR,
-    )
+    status = AutopilotStatus(heartbeat_stamp_s=5.0, armed=armed, mode=FlightMode.OFFBOARD, landed=LandedState.IN_AIR)
     mocap = MocapPose(
         stamp_s=4.9,
         frame_number=1,
@@ -148,14 +126,7 @@ def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
         tracking_valid=tracking,
         marker_error_m=0.0,
     )
-    return Inputs(
-        tick=9,
-        t_s=5.0,
-        status=status,
-        mocap=mocap,
-        command=OperatorCommand.NONE,
-        recorder_dropped=0,
-    )
+    return Inputs(tick=9, t_s=5.0, status=status, mocap=mocap, command=OperatorCommand.NONE, recorder_dropped=0)
 
 
 @pytest.fixture(scope="module")
@@ -184,26 +155,20 @@ def test_when_the_rotors_may_turn(
     pair: Pair, waiting: Outputs, armed: bool, request_: AutopilotRequest, kind: PhaseKind, lifting: bool
 ) -> None:
     client, guardian = pair
-    guard = HeartbeatSender(
-        client,
-        LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=14540, peer=("10.0.0.7", 14580)),
-        77.0,
-    )
+    guard = HeartbeatSender(client, LINK, 77.0)
     guard.tick(inputs(armed=armed), msgspec.structs.replace(waiting, request=request_, phase_kind=kind))
-    beat = heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES))
-    assert beat is not None
-    assert beat.lifting is lifting
-    assert (beat.tick, beat.t_s, beat.origin_s) == (9, 5.0, 77.0)
-    assert (beat.autopilot_system, beat.own_system, beat.own_component, beat.local_port) == (1, 1, 195, 14540)
-    assert beat.peer == ("10.0.0.7", 14580)
-    assert (beat.pose_stamp_s, beat.position_world_m) == (4.9, (1.0, 2.0, 3.0))
+    sent = heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES))
+    assert sent is not None
+    assert sent.lifting is lifting
+    assert (sent.tick, sent.t_s, sent.origin_s) == (9, 5.0, 77.0)
+    assert (sent.autopilot_system, sent.own_system, sent.own_component, sent.local_port) == (1, 1, 195, 14540)
+    assert sent.peer == ("10.0.0.7", 14580)
+    assert (sent.pose_stamp_s, sent.position_world_m) == (4.9, (1.0, 2.0, 3.0))
 
 
 def test_a_pilot_stays_one_and_a_rejected_pose_is_not_passed_on(pair: Pair, waiting: Outputs) -> None:
     client, guardian = pair
-    guard = HeartbeatSender(
-        client, LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0
-    )
+    guard = HeartbeatSender(client, LINK, 0.0)
     event = Event(
         t_s=5.0, id="pilot_took_over", severity=Severity.CRITICAL, action=SafetyAction.AUTOPILOT_LAND, text="a pilot"
     )
@@ -221,9 +186,7 @@ def test_a_pilot_stays_one_and_a_rejected_pose_is_not_passed_on(pair: Pair, wait
 def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiting: Outputs) -> None:
     """Whatever the outcome, the guardian must stop turning rotors once this process is gone."""
     client, guardian = pair
-    guard = HeartbeatSender(
-        client, LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0
-    )
+    guard = HeartbeatSender(client, LINK, 0.0)
     guard.tick(inputs(armed=True), msgspec.structs.replace(waiting, phase_kind=PhaseKind.DONE))
     guard.goodbye(inputs(armed=True).status)
     guard.goodbye(inputs(armed=False).status)
@@ -235,7 +198,7 @@ def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiti
 def test_motion_capture_is_refused_from_the_landing_for_it_until_it_is_trusted_again(
     waiting: Outputs, event_id: str
 ) -> None:
-    heartbeats = Heartbeats(LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
+    heartbeats = Heartbeats(LINK, 0.0)
     bad = msgspec.structs.replace(waiting, mocap_trusted=False)
     landing = Event(
         t_s=5.0, id=event_id, severity=Severity.CRITICAL, action=SafetyAction.AUTOPILOT_LAND, text="not believed"
@@ -252,7 +215,7 @@ def test_motion_capture_is_refused_from_the_landing_for_it_until_it_is_trusted_a
 
 
 def test_the_way_back_from_a_surface_stays_until_a_landing_has_flown_it(waiting: Outputs) -> None:
-    heartbeats = Heartbeats(LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=0), 0.0)
+    heartbeats = Heartbeats(LINK, 0.0)
     touching = contact.entered(contact.begun(4.0, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 4.5, ContactMode.PRESS)
     returning = contact.entered(touching, 4.6, ContactMode.RETURN)
 

@@ -14,6 +14,7 @@ from companion.config.loader import load_flight
 from companion.mission.active_plan import HOLD_DECELERATION_M_S2, ActiveTrajectory
 from companion.mission.plan import Plan
 from companion.model.types import Reference
+from tests.mission.test_plan import accelerations, rates, values
 
 START_S = 100.0
 STEP_S = 0.005
@@ -23,18 +24,6 @@ STEP_S = 0.005
 def plan(name: str) -> Plan:
     config = load_flight(f"configs/missions/{name}.yaml")
     return Plan.build(config.mission, config.vehicle)
-
-
-def rates(r: Reference) -> tuple[float, ...]:
-    return (*r.velocity_world_m_s, r.yaw_rate_rad_s, *r.arm_rate_rad_s)
-
-
-def values(r: Reference) -> tuple[float, ...]:
-    return (*r.position_world_m, r.yaw_rad, *r.arm_rad)
-
-
-def accelerations(r: Reference) -> tuple[float, ...]:
-    return (*r.acceleration_world_m_s2, *r.arm_acceleration_rad_s2)
 
 
 def assert_rates_are_derivatives(samples: list[Reference]) -> None:

@@ -404,7 +404,7 @@ def test_the_simulated_world_has_servos_with_the_torque_of_the_motors(tmp_path: 
 
     asyncio.run(served())
     assert messages == [
-        WorldProgress("devices.arm.type: the simulated world has a dynamixel, which is used in place of moteus"),
+        WorldProgress("devices.arm.type: the simulated world has a dynamixel, which is used in place of moteus")
     ]
 
 

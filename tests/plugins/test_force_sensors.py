@@ -19,7 +19,7 @@ from pydantic import JsonValue
 from companion.cli.main import main
 from companion.config.devices import ForceDevice
 from companion.config.document import ConfigError
-from companion.config.loader import load_flight, load_vehicle, logged_flight
+from companion.config.loader import load_flight, load_vehicle
 from companion.flight.main import plugins_of_others
 from companion.io.force_torque.plugin_driver import PluginForceTorque, open_force
 from companion.io.protocols import DeviceError
@@ -336,23 +336,6 @@ async def test_a_record_of_the_wrong_size_ends_the_stream() -> None:
 
 
 # -- lists and logs ------------------------------------------------------------------------------------------------------------
-
-
-def test_the_list_of_plug_ins_names_each_sensor(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["plugins"]) == EXIT_BAD_INPUT
-    lines = {line.split("  ")[0]: line for line in capsys.readouterr().out.splitlines()}
-    assert "companion-aerial-manipulation" in lines["rft60"] and "Robotous RFT60-HA01" in lines["rft60"]
-    assert "companion-ati" in lines["ati"] and "ATI Net F/T over its UDP stream" in lines["ati"]
-    assert "cannot be used: its attribute 'options' is not a subclass" in lines["nooptions"]
-
-
-def test_a_log_is_read_without_the_sensor() -> None:
-    overrides = ["vehicle.devices.force.type=bota"]
-    logged = load_flight("hover", overrides=overrides)
-    force = logged_flight(logged.model_dump_json()).vehicle.devices.force
-    assert force is not None and force.type == "bota"
-    with pytest.raises(ConfigError, match="'bota': is not installed"):
-        load_flight("hover", overrides=overrides, hardware=True)
 
 
 def test_only_the_built_in_sensor_has_a_zero_to_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

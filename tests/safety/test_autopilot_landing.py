@@ -7,22 +7,12 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.model.types import (
-    AutopilotRequest,
-    AutopilotStatus,
-    FlightMode,
-    Inputs,
-    LandedState,
-    MocapPose,
-    OperatorCommand,
-    Quat,
-    VehicleState,
-)
+from companion.model.types import AutopilotRequest, FlightMode, Inputs, LandedState, Quat
 from companion.safety.autopilot_landing import IMPACT_HOLD_S, TIMEOUT_S, AutopilotLanding, LandingStep
 from companion.safety.touchdown import HEIGHT_HOLD_S, HEIGHT_MARGIN_M
+from tests.safety.healthy import healthy, put
 
 LEVEL: Quat = (1.0, 0.0, 0.0, 0.0)
-ZERO = (0.0, 0.0, 0.0)
 CLEARANCE_M = 0.3
 TILT_MAX_RAD = math.radians(40.0)
 
@@ -47,38 +37,25 @@ def seen(
     aside_m: float = 0.0,
 ) -> Inputs:
     """PX4 at a height, in a mode, armed; motion capture agrees where it is not given another value."""
-    return Inputs(
-        tick=0,
-        t_s=t_s,
-        vehicle=VehicleState(
-            position_stamp_s=t_s if position_s is None else position_s,
-            attitude_stamp_s=t_s if attitude_s is None else attitude_s,
-            imu_stamp_s=t_s if imu_s is None else imu_s,
-            position_world_m=(aside_m, 0.0, height_m),
-            velocity_world_m_s=(0.0, 0.0, -sink_m_s),
-            attitude_wxyz=attitude,
-            angular_rate_body_rad_s=ZERO,
-            specific_force_body_m_s2=(0.0, 0.0, feels_m_s2),
-        ),
-        status=AutopilotStatus(
-            heartbeat_stamp_s=t_s if heard_s is None else heard_s,
-            armed=armed,
-            mode=mode,
-            landed=landed,
-            battery_voltage_v=16.0,
-            battery_remaining=0.9,
-        ),
-        mocap=MocapPose(
-            stamp_s=t_s if mocap else 0.0,
-            frame_number=1,
-            position_world_m=(aside_m, 0.0, height_m if mocap_m is None else mocap_m),
-            attitude_wxyz=attitude if mocap_attitude is None else mocap_attitude,
-            tracking_valid=True,
-            marker_error_m=0.0,
-        ),
-        command=OperatorCommand.NONE,
-        recorder_dropped=0,
+    vehicle = put(
+        "vehicle",
+        position_stamp_s=t_s if position_s is None else position_s,
+        attitude_stamp_s=t_s if attitude_s is None else attitude_s,
+        imu_stamp_s=t_s if imu_s is None else imu_s,
+        position_world_m=(aside_m, 0.0, height_m),
+        velocity_world_m_s=(0.0, 0.0, -sink_m_s),
+        attitude_wxyz=attitude,
+        specific_force_body_m_s2=(0.0, 0.0, feels_m_s2),
     )
+    heartbeat_s = t_s if heard_s is None else heard_s
+    status = put("status", heartbeat_stamp_s=heartbeat_s, armed=armed, mode=mode, landed=landed)
+    pose = put(
+        "mocap",
+        stamp_s=t_s if mocap else 0.0,
+        position_world_m=(aside_m, 0.0, height_m if mocap_m is None else mocap_m),
+        attitude_wxyz=attitude if mocap_attitude is None else mocap_attitude,
+    )
+    return pose(status(vehicle(healthy(t_s=t_s))))
 
 
 class Landing:

@@ -18,6 +18,7 @@ from companion.mission.reference import at_rest
 from companion.model.outputs import TetherState
 from companion.model.types import Reference, Vec3
 from companion.safety.governor import Governed, Governor, SafeSet, _share_within
+from tests.safety.healthy import SLOW
 from tests.support import tether_of
 
 DT_S = 0.005
@@ -40,19 +41,7 @@ def asked(p: Vec3, v: Vec3 = (0.0, 0.0, 0.0), a: Vec3 = (0.0, 0.0, 0.0)) -> Refe
 
 
 def tether(*, taut: bool = False, snagged: bool = False) -> TetherState:
-    return TetherState(
-        range_m=2.0,
-        slack_m=0.0,
-        stop_slack_m=0.0,
-        elevation_rad=0.5,
-        clearance_m=0.1,
-        turns=0.0,
-        pull_n=0.0,
-        taut=taut,
-        snagged=snagged,
-        separated=False,
-        vehicle_turns=0.0,
-    )
+    return replace(SLOW, taut=taut, snagged=snagged)
 
 
 def stop_of(g: Governor, reference: Reference) -> Vec3:

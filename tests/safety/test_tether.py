@@ -177,11 +177,7 @@ def ring_distance_m(clearance_of: Vehicle, ray: Vec3) -> float:
 )
 def test_clearance_of_the_rotors_against_brute_force(azimuth: float, elevation: float, tied: Vec3) -> None:
     machine = vehicle(f"vehicle.tether.attachment_body_m={list(tied)}")
-    ray = (
-        math.cos(elevation) * math.cos(azimuth),
-        math.cos(elevation) * math.sin(azimuth),
-        -math.sin(elevation),
-    )
+    ray = (math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), -math.sin(elevation))
     found, true = clearance(machine).least_m(ray, None, FOLDED), ring_distance_m(machine, ray)
     through_the_middle = math.hypot(tied[0], tied[1]) < tether_of(machine).rotor_inner_radius_m
     if true <= 0.0:

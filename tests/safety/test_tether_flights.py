@@ -25,7 +25,7 @@ def event_ids(result: FastResult) -> list[str]:
     [("world.payload_kg=0.1", "world.wind_m_s=[3, 0, 0]"), ("world.payload_kg=0.4", "world.hover_thrust_error=-0.1")],
 )
 def test_an_ordinary_flight_raises_no_alarm(overrides: tuple[str, ...]) -> None:
-    result = FastFlight(config(*overrides)).run(until_mission_s=11.0)
+    result = FastFlight(config(*overrides)).run(until_mission_s=9.0)
     assert event_ids(result) == ["takeoff", "catch"]
     assert all(o.action is SafetyAction.NOMINAL and not o.limited_by and o.mocap_trusted for o in result.outputs)
     states = [o.tether for o in result.outputs if o.tether is not None and o.phase_kind is PhaseKind.FLIGHT]
@@ -39,7 +39,7 @@ def test_an_ordinary_flight_raises_no_alarm(overrides: tuple[str, ...]) -> None:
 def test_wind_of_5_m_s_from_ahead_is_no_tether_that_pulls() -> None:
     """It presses with 4 to 6 N, mostly by the rotors' drag. The tilt against it brings the rotors nearer to the line."""
     result = FastFlight(config("world.rotors={on: true, drag_s_m: 0.03}", "world.wind_m_s=[-5, 0, 0]")).run(
-        until_mission_s=11.0
+        until_mission_s=9.0
     )
     assert set(event_ids(result)) - {"tether_near"} == {"takeoff", "catch"}
     assert all(o.action.rank <= SafetyAction.WARN.rank for o in result.outputs)
