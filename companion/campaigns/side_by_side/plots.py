@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,7 +19,6 @@ from companion.analysis.log import Array
 from companion.analysis.page import Picture
 from companion.analysis.plot_style import (
     COLOURS,
-    INK,
     SOFT,
     dress,
     figure_legend,
@@ -48,11 +47,6 @@ LINES = tuple(
 )
 """Line styles of the flights, by position."""
 _EVENT_MARKS = {"info": ("|", 7.0), "warning": ("^", 6.0), "critical": ("X", 7.5)}
-_NAME_SHARE = 0.0074
-"""Width of one character of an event's name, as a fraction of the axis."""
-_CROWD_SHARE = 0.015
-"""Distance below which event marks overlap, as a fraction of the axis."""
-_SEVERITY = {"warning": 1, "critical": 2}
 
 
 def write_pictures(comparison: Comparison, out_dir: Path) -> list[Picture]:
@@ -150,62 +144,20 @@ def _style(n: int) -> dict[str, Any]:
 
 
 def _lane(ax: Any, comparison: Comparison) -> None:
-    """Draw one row of events for each flight, with names where there is room."""
+    """Draw one row of events for each flight; the page has a table of them."""
     dress(ax)
     count = len(comparison.flights)
     low, high = ax.get_xlim()
     for n, (flight, zero_s) in enumerate(zip(comparison.flights, comparison.zeros_s, strict=True)):
-        height = count - 1 - n
-        events = sorted(
-            (float(event["t_s"]) - zero_s, event["severity"], event["id"]) for event in flight.summary["events"]
-        )
-        events = [event for event in events if low <= event[0] <= high]
-        for t, severity, _ in events:
-            mark, size = _EVENT_MARKS.get(severity, _EVENT_MARKS["info"])
-            ax.plot(t, height, mark, color=LINES[n].colour, ms=size, mew=1.4, zorder=4, clip_on=False)
-        _names(ax, events, height, low, high)
+        for event in flight.summary["events"]:
+            t = float(event["t_s"]) - zero_s
+            if low <= t <= high:
+                mark, size = _EVENT_MARKS.get(event["severity"], _EVENT_MARKS["info"])
+                ax.plot(t, count - 1 - n, mark, color=LINES[n].colour, ms=size, mew=1.4, zorder=4, clip_on=False)
     ax.set_ylim(-0.6, count - 0.4)
     ax.set_yticks(range(count), [flight.letter for flight in reversed(comparison.flights)])
     ax.set_ylabel("events")
     ax.grid(visible=False, axis="y")
-
-
-def _names(ax: Any, events: list[tuple[float, str, str]], height: float, low: float, high: float) -> None:
-    """Name each group of marks by its most severe event if the name covers no other mark."""
-    crowds: list[list[tuple[float, str, str]]] = []
-    for event in events:
-        if crowds and event[0] - crowds[-1][-1][0] < _CROWD_SHARE * (high - low):
-            crowds[-1].append(event)
-        else:
-            crowds.append([event])
-    free_from = low
-    for k, crowd in enumerate(crowds):
-        name = max(crowd, key=lambda event: _SEVERITY.get(event[1], 0))[2] + (
-            f" +{len(crowd) - 1}" if crowd[1:] else ""
-        )
-        width = (high - low) * _NAME_SHARE * (len(name) + 2)
-        first, last = crowd[0][0], crowd[-1][0]
-        if last >= free_from and last + width <= (crowds[k + 1][0][0] if k + 1 < len(crowds) else high):
-            _name(ax, name, last, height, "left")
-            free_from = last + width
-        elif first - width >= free_from:
-            _name(ax, name, first, height, "right")
-            free_from = last
-        else:
-            free_from = max(free_from, last)
-
-
-def _name(ax: Any, text: str, t: float, height: float, side: Literal["left", "right"]) -> None:
-    ax.annotate(
-        text.replace("$", r"\$"),
-        (t, height),
-        xytext=(6 if side == "left" else -6, 0),
-        textcoords="offset points",
-        ha=side,
-        va="center",
-        fontsize=7.5,
-        color=INK,
-    )
 
 
 def _mark_zero(comparison: Comparison, axes: list[Any]) -> None:
