@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import math
+from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from companion.config.airframe import Airframe
 from companion.px4.rotors import geometry_of
@@ -38,63 +39,79 @@ class Observation(NamedTuple):
     nav_state: NavState | None
 
 
-class AutopilotBackend(Protocol):
-    """An autopilot of the simulated world. The plant steps it with IMU samples."""
+class AutopilotBackend(ABC):
+    """An autopilot of the simulated world. The plant steps it with IMU samples. What is not abstract holds for one in this process."""
 
-    lockstep: bool
+    lockstep = False
     """Whether the autopilot answers over a network link; if so, the world calls `sense` and awaits `answered` before each `step`."""
-
-    @property
-    def armed(self) -> bool:
-        """Whether the rotors may turn."""
-
-    @property
-    def fault_target(self) -> FaultTarget:
-        """The object through which autopilot faults are injected."""
 
     @property
     def down(self) -> bool:
         """Whether the autopilot is booting and does not communicate."""
+        return False
 
     @property
+    @abstractmethod
+    def armed(self) -> bool:
+        """Whether the rotors may turn."""
+
+    @property
+    @abstractmethod
+    def fault_target(self) -> FaultTarget:
+        """The object through which autopilot faults are injected."""
+
+    @property
+    @abstractmethod
     def vision_address(self) -> Address:
         """Address of the MAVLink link on which another program may send external vision, while the links are open."""
 
+    @abstractmethod
     def attach(self, machine: Machine) -> None:
         """Set the machine that the autopilot flies; call this method before all others."""
 
+    @abstractmethod
     def wires(self) -> AbstractAsyncContextManager[str]:
         """Open the autopilot's links and yield the value for the companion's `devices.autopilot.address`."""
 
-    async def prepare(self) -> None:
-        """Make the autopilot ready to fly while the world is being stepped."""
-
-    def sense(self, imu: ImuSample) -> None:
-        """Send the IMU sample of the next `step` to the autopilot as soon as it is known."""
-
-    async def answered(self) -> None:
-        """Wait until the autopilot has answered the sample that `sense` sent."""
-
+    @abstractmethod
     def step(self, imu: ImuSample) -> RotorCommands:
         """Process one IMU sample and return normalised rotor commands (0 to 1), which are zero while disarmed."""
 
+    @abstractmethod
     def pump(self, t_s: float, battery: Battery) -> None:
         """Stream telemetry; call this method after every step of the physics."""
 
+    @abstractmethod
     def set_link(self, down: bool, delay_s: float) -> None:
         """Inject link faults in both directions: nothing arrives if `down`; otherwise messages arrive `delay_s` late."""
 
-    def start_over(self) -> bool:
-        """Return to the state before the first step, because world time starts over; return False if this autopilot cannot."""
-
-    def skip(self, paused_s: float) -> None:
-        """Advance the autopilot's own clock by a pause of the world, because a real autopilot's clock does not pause."""
-
+    @abstractmethod
     def observe(self) -> Observation:
         """Return the autopilot's observable state."""
 
+    @abstractmethod
     def about(self) -> dict[str, Any]:
         """Return the autopilot's kind (stub or px4) and version, for `summary.json`."""
+
+    async def prepare(self) -> None:
+        """Make the autopilot ready to fly while the world is being stepped."""
+        return
+
+    def sense(self, imu: ImuSample) -> None:
+        """Send the IMU sample of the next `step` to the autopilot as soon as it is known."""
+        return
+
+    async def answered(self) -> None:
+        """Wait until the autopilot has answered the sample that `sense` sent."""
+        return
+
+    def start_over(self) -> bool:
+        """Return to the state before the first step, because world time starts over; return False if this autopilot cannot."""
+        return False
+
+    def skip(self, paused_s: float) -> None:
+        """Advance the clock of an autopilot that has one besides world time by a pause of the world."""
+        return
 
 
 def stub_of(config: WorldConfig, airframe: Airframe, link_delay_s: float = 0.0) -> Px4Stub:
@@ -150,10 +167,8 @@ def set_hover_thrust(px4: Px4Stub, config: WorldConfig, machine: Machine) -> flo
     return hover_thrust
 
 
-class StubBackend:
+class StubBackend(AutopilotBackend):
     """The PX4 stub, which runs in this process."""
-
-    lockstep = False
 
     def __init__(
         self,
@@ -201,15 +216,6 @@ class StubBackend:
         vision = (VISION_PORTS if self._ports.remote else Ports(0, 0)) if self._external_vision else None
         async with MavlinkServer(self.px4, self._ports, ground, vision, in_lockstep=self._in_lockstep) as self._mavlink:
             yield f"udpout://127.0.0.1:{self._mavlink.onboard_port}"
-
-    async def prepare(self) -> None:
-        """Do nothing: the stub is ready at once."""
-
-    def sense(self, imu: ImuSample) -> None:
-        """Do nothing: the stub takes the sample in `step`."""
-
-    async def answered(self) -> None:
-        """Return at once: the stub answers within `step`."""
 
     def step(self, imu: ImuSample) -> RotorCommands:
         """Run one control period."""

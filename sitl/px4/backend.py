@@ -15,7 +15,7 @@ from companion.config.airframe import Airframe
 from companion.px4.versions import varies
 from companion.sitl_config.faults import FaultKind
 from companion.sitl_config.world import World as WorldConfig
-from sitl.autopilot.backend import Observation
+from sitl.autopilot.backend import AutopilotBackend, Observation
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Value
 from sitl.autopilot.types import Battery, FaultTarget, ImuSample, RotorCommands
@@ -74,7 +74,7 @@ def refuse_stub_only_settings(config: WorldConfig) -> None:
         )
 
 
-class RealPx4:
+class RealPx4(AutopilotBackend):
     """One PX4 for one flight.
 
     Args:
@@ -88,6 +88,7 @@ class RealPx4:
     """
 
     lockstep = True
+    refuses_offboard = refuses_arming = kill_switch = False
 
     def __init__(self, airframe: Airframe, config: WorldConfig, folder: Path, progress: Progress) -> None:
         refuse_stub_only_settings(config)
@@ -118,19 +119,22 @@ class RealPx4:
         return self._link.armed
 
     @property
-    def down(self) -> bool:
-        """Whether PX4 is booting; always False, because a real PX4 does not restart in flight."""
-        return False
-
-    @property
     def vision_address(self) -> Address:
         """Address of the gimbal link, which nothing else uses."""
         return self._instance.gimbal_address
 
     @property
     def fault_target(self) -> FaultTarget:
-        """The object through which the faults that a real PX4 can have are injected."""
-        return _Faulty(self._control)
+        """This object, for the one fault that a real PX4 can have; `refuse_stub_only_settings` has rejected the others."""
+        return self
+
+    def reboot(self, for_s: float) -> None:
+        """Reject the fault; never called (`refuse_stub_only_settings`)."""
+        raise Px4Error("world.faults: autopilot_reboot needs the stub; run with --sitl")
+
+    def pilot_sets_mode(self, state: NavState) -> None:
+        """Change the mode as a ground station does."""
+        self._control.request_mode(state)
 
     def attach(self, machine: Machine) -> None:
         """Set the machine that PX4's simulated sensors measure."""
@@ -290,13 +294,6 @@ class RealPx4:
         if self._relay is not None:
             self._relay.down, self._relay.delay_s = down, delay_s
 
-    def start_over(self) -> bool:
-        """Return False: the clock of a real PX4 cannot go back."""
-        return False
-
-    def skip(self, paused_s: float) -> None:
-        """Do nothing: PX4 has no clock but world time, and a gap in its samples would disturb its estimate."""
-
     def observe(self) -> Observation:
         """Return PX4's mode; the other fields are None, because only PX4's own log shows its inputs."""
         return Observation(None, None, self._control.nav_state)
@@ -331,29 +328,6 @@ class RealPx4:
             self.sense(imu._replace(t_s=t_s))
             await asyncio.sleep(SAMPLE_S)
         process.kill()
-
-
-class _Faulty:
-    """Injects the one fault that a real PX4 can have: a pilot changes the mode."""
-
-    refuses_offboard = False
-    refuses_arming = False
-    kill_switch = False
-
-    def __init__(self, control: ControlLink) -> None:
-        self._control = control
-
-    def reboot(self, for_s: float) -> None:
-        """Reject the fault, which `refuse_stub_only_settings` has already rejected before the flight.
-
-        Raises:
-            Px4Error: always.
-        """
-        raise Px4Error("world.faults: autopilot_reboot needs the stub; run with --sitl")
-
-    def pilot_sets_mode(self, state: NavState) -> None:
-        """Change the mode as a ground station does."""
-        self._control.request_mode(state)
 
 
 def _as_type_of(known: Value, value: Value) -> Value:
