@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +15,6 @@ from companion.config.document import ConfigError, Data, Document, Origin, key_p
 from companion.config.explain import validate
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import parse_value, read_document
-from companion.config.yaml_text import flow_text
 from companion.runtime.files import write_whole
 
 _BOM = "\ufeff"
@@ -65,16 +65,11 @@ class Patch:
 
     @property
     def text(self) -> str:
-        """Return the changed lines in the file's own format, each with the line that it replaces."""
+        """Return the change as a unified diff."""
         if not self.changes:
             return f"# {self.shown}: nothing to change"
-        lines: list[tuple[str, str]] = [(f"# {self.shown}", "")]
-        open_steps: Location = ()
-        for change in sorted(self.changes, key=lambda one: [str(step) for step in one.location]):
-            lines += _lines(open_steps, change, self.shown)
-            open_steps = change.location[:-1]
-        width = min(48, max(len(left) for left, right in lines if right))
-        return "\n".join(f"{left:<{width}}  # {right}" if right else left for left, right in lines)
+        old, new = (data.decode("utf-8-sig").splitlines() for data in (self.before, self.after))
+        return "\n".join(difflib.unified_diff(old, new, self.shown, self.shown, n=1, lineterm=""))
 
     def as_json(self) -> dict[str, Any]:
         """Return the patch as part of the JSON document."""
@@ -149,34 +144,6 @@ def _check(shown: str, text: str, changes: tuple[Change, ...]) -> None:
             raise ConfigError(f"{shown}: {change.key} cannot be changed by this tool; write it by hand: {change.new}")
     if validate(Vehicle, document) is None:
         raise ConfigError([f"{line} (after the proposed change)" for line in problem_lines(document.problems)])
-
-
-def _lines(open_steps: Location, change: Change, shown: str) -> list[tuple[str, str]]:
-    """Return the changed line with a remark on the old value, below the lines of any blocks that the change opens."""
-    *way, last = change.location
-    common = 0
-    while common < min(len(open_steps), len(way)) and open_steps[common] == way[common]:
-        common += 1
-    lines: list[tuple[str, str]] = []
-    dash = False
-    for depth in range(common, len(way)):
-        step = way[depth]
-        if isinstance(step, int):
-            lines.append((f"{_indent(way[:depth])}# {key_path(tuple(way[: depth + 1]))}", ""))
-            dash = True
-        else:
-            lines.append((f"{_indent(way[:depth], dash)}{step}:", ""))
-            dash = False
-    at = change.origin
-    was = f"{shown}:{at.line}: was {flow_text(change.old)}" if at is not None else "new"
-    name = f"- {flow_text(change.new)}" if isinstance(last, int) else f"{last}: {flow_text(change.new)}"
-    return [*lines, (f"{_indent(way, dash)}{name}", was)]
-
-
-def _indent(way: list[str | int] | Location, dash: bool = False) -> str:
-    """Return two columns per step; the first key of a list item follows its dash."""
-    width = 2 * len(way)
-    return " " * (width - 2) + "- " if dash else " " * width
 
 
 def _back_up(path: Path, data: bytes) -> Path:
