@@ -6,14 +6,13 @@ import csv
 import json
 from pathlib import Path
 
-from tests.support import run_here
-
-SHORT = "mission.phases[2].waypoints=[{position_m: [-0.95, 0.0]}]"
+from tests.support import SHORT_CARRY, run_here
 
 
 def test_a_team_is_flown_in_drawn_laboratories_and_its_rows_carry_the_figures_of_the_bar(tmp_path: Path) -> None:
     ended = run_here(
-        *("robustness", "carry", "--draws", "1", "--seed", "3", "--jobs", "1", "--set", SHORT),
+        *("robustness", "carry", "--draws", "1", "--seed", "3", "--jobs", "1"),
+        *(word for override in SHORT_CARRY for word in ("--set", override)),
         *("--json", "--out", tmp_path),
     )
     assert ended.code == 0, ended.err
