@@ -16,7 +16,7 @@ from companion.model.types import Joints
 
 SWING_DEG, SWING_MIN_DEG = 45.0, 25.0
 """Swing of a joint whose limits exclude a turn to an exact direction."""
-_STRAIGHT_DEG = ((0.0, 0.0), (90.0, 0.0))
+_STRAIGHT_DEG = (0.0, 90.0)
 _DIRECTIONS = {
     0: "straight forward (towards the nose), level",
     90: "straight down, plumb",
@@ -49,88 +49,45 @@ class Step:
 def steps_of(arm: Arm) -> tuple[Step, ...]:
     """Return the steps for an arm, within its limits: straight, then each joint alone, from the last one to the shoulder.
 
+    The planar arm of two joints is told where its links point; of any other arm, only the vehicle file defines the directions.
+
     Raises:
-        ConfigError: the joint limits allow no straight pose, or leave a joint too small a range.
+        ConfigError: the joint limits of a planar arm allow no straight pose, or a joint has too small a range.
     """
-    if len(arm.joints) != 2:
-        return _steps_by_angle(arm)
-    first, second = arm.joints
-    straight = next((pose for pose in _STRAIGHT_DEG if _within(first, pose[0]) and _within(second, pose[1])), None)
-    if straight is None:
+    planar = len(arm.joints) == 2
+    pose = _start_deg(arm, planar)
+    where = f"hold the arm with its joints at {_angles(pose)} deg, as the vehicle file defines them"
+    if planar:
+        where = f"hold the whole arm {_direction(pose[0])}, both links in one line"
+    name = "straight" if planar else "start"
+    steps = [Step(name=name, instruction=where, joint=None, by_deg=0.0, exact=True, pose_deg=tuple(pose))]
+    for index in reversed(range(len(arm.joints))):
+        from_deg = pose[0]
+        by_deg, exact = _turn(arm.joints[index], pose[index], index)
+        pose[index] += by_deg
+        if planar:
+            name, text_of = (("shoulder", _shoulder_text), ("elbow", _elbow_text))[index]
+            text = text_of(from_deg, by_deg, exact)
+        else:
+            name, way = f"joint {index + 1}", "positive" if by_deg > 0.0 else "negative"
+            how = f"by {by_deg:+.0f} deg" if exact else f"in its {way} direction by about {abs(by_deg):.0f} deg"
+            text = f"turn {name} alone {how}, as the vehicle file defines its direction"
+        steps.append(Step(name=name, instruction=text, joint=index, by_deg=by_deg, exact=exact, pose_deg=tuple(pose)))
+    return tuple(steps)
+
+
+def _start_deg(arm: Arm, planar: bool) -> list[float]:
+    """Return the first pose: straight, or for an arm that is not planar and cannot be, as near to zero as it goes."""
+    others = [0.0] * (len(arm.joints) - 1)
+    for first in _STRAIGHT_DEG:
+        if all(map(_within, arm.joints, (first, *others))):
+            return [first, *others]
+    if planar:
         raise ConfigError(
             "arm.joints[].angle_deg: the limits allow neither straight forward (0, 0) nor straight down (90, 0), and one of "
             "the two is needed to find the zeros; widen the limits to the arm's real range"
         )
-    elbow_deg, elbow_exact = _turn(second, straight[1], 1)
-    shoulder_deg, shoulder_exact = _turn(first, straight[0], 0)
-    bent = straight[1] + elbow_deg
-    swung = straight[0] + shoulder_deg
-    return (
-        Step(
-            name="straight",
-            instruction=f"hold the whole arm {_direction(straight[0])}, both links in one line",
-            joint=None,
-            by_deg=0.0,
-            exact=True,
-            pose_deg=straight,
-        ),
-        Step(
-            name="elbow",
-            instruction=_elbow_text(straight[0], elbow_deg, elbow_exact),
-            joint=1,
-            by_deg=elbow_deg,
-            exact=elbow_exact,
-            pose_deg=(straight[0], bent),
-        ),
-        Step(
-            name="shoulder",
-            instruction=_shoulder_text(straight[0], shoulder_deg, shoulder_exact),
-            joint=0,
-            by_deg=shoulder_deg,
-            exact=shoulder_exact,
-            pose_deg=(swung, bent),
-        ),
-    )
-
-
-def _steps_by_angle(arm: Arm) -> tuple[Step, ...]:
-    """Return the steps for an arm other than the planar one of two joints: only the vehicle file defines its directions."""
-    others = [0.0] * (len(arm.joints) - 1)
-    within = [
-        angles for angles in ([first, *others] for first, _ in _STRAIGHT_DEG) if all(map(_within, arm.joints, angles))
-    ]
-    pose = (
-        within[0] if within else [max(low, min(high, 0.0)) for low, high in (joint.angle_deg for joint in arm.joints)]
-    )
-    steps = [
-        Step(
-            name="start",
-            instruction=f"hold the arm with its joints at {_angles(pose)} deg, as the vehicle file defines them",
-            joint=None,
-            by_deg=0.0,
-            exact=True,
-            pose_deg=tuple(pose),
-        )
-    ]
-    for index in reversed(range(len(arm.joints))):
-        by_deg, exact = _turn(arm.joints[index], pose[index], index)
-        pose[index] += by_deg
-        how = (
-            f"by {by_deg:+.0f} deg"
-            if exact
-            else f"in its {'positive' if by_deg > 0.0 else 'negative'} direction by about {abs(by_deg):.0f} deg"
-        )
-        steps.append(
-            Step(
-                name=f"joint {index + 1}",
-                instruction=f"turn joint {index + 1} alone {how}, as the vehicle file defines its direction",
-                joint=index,
-                by_deg=by_deg,
-                exact=exact,
-                pose_deg=tuple(pose),
-            )
-        )
-    return tuple(steps)
+    return [max(low, min(high, 0.0)) for low, high in (joint.angle_deg for joint in arm.joints)]
 
 
 def _angles(angles_deg: Sequence[float]) -> str:
