@@ -14,7 +14,6 @@ from companion.commissioning.arm.scan import judge
 from companion.commissioning.arm.servo import SETTINGS, FoundServo, Scan, assign, settings
 from companion.commissioning.arm.setup import plan
 from companion.commissioning.arm.sweep import REACH_DEG, Sweeper, hanging_deg, legs_of
-from companion.commissioning.arm.zero import ZeroGuide, ZeroView
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.control.arm_model import manipulator_of
@@ -22,10 +21,11 @@ from companion.io.dynamixel import registers as dxl
 from companion.model.check_row import Level
 from companion.model.exit_codes import EXIT_OK
 from companion.model.servos import COUNTS_PER_TURN
-from companion.model.types import IDENTITY_QUAT, ArmState, Joints
+from companion.model.types import IDENTITY_QUAT, ArmState
 from companion.preflight import arm as preflight
 from sitl.servo.model import ServoModel
 from tests.commissioning.arm_rig import FILES, SHIPPED, bench
+from tests.commissioning.test_arm_zero import Bench
 from tests.machines import vehicle_with_joints
 from tests.preflight import records
 
@@ -54,30 +54,10 @@ def state(t_s: float, angle_rad: Sequence[float]) -> ArmState:
 def test_zeros_signs_and_plugs_of_any_number_of_joints_are_found(count: int) -> None:
     arm = vehicle_with_joints(count).arm
     signs, zeros = [1, -1, -1, 1][:count], [100, 4000, 2048, 1][:count]
-    plugs = [*range(1, count), 0]
-    """Servo that turns with each joint."""
-    guide, t_s = ZeroGuide(arm), 0.0
-
-    def look(pose_deg: Joints) -> ZeroView:
-        counts = [0] * count
-        for joint, angle_deg in enumerate(pose_deg):
-            counts[plugs[joint]] = zeros[joint] + signs[joint] * round(angle_deg * COUNTS_PER_TURN / 360.0)
-        return guide.update(t_s, tuple(counts))
-
-    at = guide.steps[0].pose_deg
-    look(tuple(angle - 20.0 for angle in at))
-    for step in guide.steps:
-        for part in range(11):
-            t_s += 0.3
-            view = look(tuple(a + part / 10.0 * (b - a) for a, b in zip(at, step.pose_deg, strict=True)))
-        at = step.pose_deg
-        while view.number <= guide.steps.index(step) + 1 and view.result is None:
-            assert not view.failed and t_s < 200.0, view
-            t_s += 0.3
-            view = look(at)
-    assert view.result is not None and view.result.swapped == (count > 1)
-    for joint, found in enumerate(view.result.joints):
-        assert (found.servo_id, found.sign) == (arm.joints[plugs[joint]].servo_id, signs[joint])
+    result = Bench(arm, signs, zeros, [count - 1, *range(count - 1)]).through().result
+    assert result is not None and result.swapped == (count > 1)
+    for joint, found in enumerate(result.joints):
+        assert (found.servo_id, found.sign) == (arm.joints[(joint + 1) % count].servo_id, signs[joint])
         assert abs((found.zero_count - zeros[joint] + 2048) % COUNTS_PER_TURN - 2048) <= 1
 
 

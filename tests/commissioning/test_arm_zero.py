@@ -38,12 +38,15 @@ class Bench:
         self.guide = ZeroGuide(arm)
         self.signs, self.zeros, self.plugs = signs, zeros, plugs
         self.t_s = 0.0
-        self.at: list[float] = list(FOLDED)
+        self.at: list[float] = (
+            list(FOLDED) if len(plugs) == 2 else [angle - 20.0 for angle in self.guide.steps[0].pose_deg]
+        )
 
-    def counts(self) -> tuple[int, int]:
+    def counts(self) -> tuple[int, ...]:
         """`plugs[servo]` is the joint that the vehicle file's servo really sits in."""
-        joint = [self.zeros[i] + self.signs[i] * round(math.radians(self.at[i]) / RAD_PER_COUNT) for i in (0, 1)]
-        return joint[self.plugs[0]], joint[self.plugs[1]]
+        angles = zip(self.zeros, self.signs, self.at, strict=True)
+        joint = [zero + sign * round(math.radians(at) / RAD_PER_COUNT) for zero, sign, at in angles]
+        return tuple(joint[plug] for plug in self.plugs)
 
     def look(self, accept: bool = False) -> ZeroView:
         self.t_s += STEP_S
@@ -59,7 +62,7 @@ class Bench:
     def hold(self) -> ZeroView:
         for _ in range(round(HELD_S / STEP_S) + 2):
             view = self.look()
-            if view.result is not None or view.failed or view.moved_deg == (0.0, 0.0):
+            if view.result is not None or view.failed or not any(view.moved_deg):
                 break
         return view
 

@@ -100,18 +100,6 @@ def test_it_writes_a_world_and_a_vehicle_file_that_load(
     assert (tmp_path / "mine.yaml.bak").read_bytes() == before
 
 
-def without_flight(log: FlightLog) -> FlightLog:
-    return cut(log, 0, 300)
-
-
-def killed(log: FlightLog) -> FlightLog:
-    return cut(log, 0, 3000)
-
-
-def short(log: FlightLog) -> FlightLog:
-    return cut(log, len(log.inputs) - 1500, len(log.inputs))
-
-
 def cut(log: FlightLog, begin: int, end: int) -> FlightLog:
     return replace(log, inputs=log.inputs[begin:end], outputs=log.outputs[begin:end], sent=log.sent[begin:end])
 
@@ -119,9 +107,9 @@ def cut(log: FlightLog, begin: int, end: int) -> FlightLog:
 @pytest.mark.parametrize(
     ("spoil", "why"),
     [
-        (without_flight, "did not fly"),
-        (killed, "was killed or its log is cut off"),
-        (short, "too short"),
+        (lambda log: cut(log, 0, 300), "did not fly"),
+        (lambda log: cut(log, 0, 3000), "was killed or its log is cut off"),
+        (lambda log: cut(log, len(log.inputs) - 1500, len(log.inputs)), "too short"),
         (lambda log: replace(log, metadata={}), "has no configuration"),
     ],
 )

@@ -73,11 +73,6 @@ def test_what_the_file_leaves_to_its_default_is_added_to_its_block(mine: Path) -
     assert lines[before + 1] == "  joint_friction_nm: 0.08"
 
 
-def test_a_list_keeps_its_comment(mine: Path) -> None:
-    propose(mine, {("arm", "link_masses_kg"): [0.16, 0.09]}).write()
-    assert "  link_masses_kg: [0.16, 0.09]   # link 1 carries" in mine.read_text(encoding="utf-8")
-
-
 @pytest.mark.parametrize(
     ("location", "value", "words"),
     [

@@ -5,17 +5,14 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import datetime
-import ipaddress
 import json
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
 import aiohttp
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
 
+from companion.ground.broker.certificates import make_authority, make_server
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.keys import Operator, Operators
 from companion.ground.protocol.proof import Signer
@@ -129,25 +126,12 @@ async def on_page(
         yield vehicle, monitor, viewer
 
 
-def self_signed(folder: Path) -> tuple[Path, Path]:
-    """Return the files of a certificate for 127.0.0.1 and its key."""
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "monitor")])
+def certificate(folder: Path) -> tuple[Path, Path, Path]:
+    """Return the files of a certificate for 127.0.0.1, its key, and the certificate of its authority."""
     now = datetime.datetime.now(datetime.UTC)
-    cert = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(days=1))
-        .not_valid_after(now + datetime.timedelta(days=1))
-        .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), critical=False)
-        .sign(key, hashes.SHA256())
-    )
-    cert_file, key_file = folder / "cert.pem", folder / "key.pem"
-    cert_file.write_bytes(cert.public_bytes(serialization.Encoding.PEM))
-    key_file.write_bytes(
-        key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    )
-    return cert_file, key_file
+    authority = make_authority(now)
+    made = make_server(authority, ["127.0.0.1"], 1, now)
+    files = folder / "cert.pem", folder / "key.pem", folder / "ca.pem"
+    for file, data in zip(files, (made.certificate, made.key, authority.certificate), strict=True):
+        file.write_bytes(data)
+    return files

@@ -24,7 +24,7 @@ from companion.model.codec import to_json
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.analysis.synthetic_flight import record_flight
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, self_signed
+from tests.ground.monitor_rig import ANNA, OPERATORS, certificate
 from tests.ground.vehicle import played_vehicle
 from tests.support import CATCH, Sandbox, sandbox_in
 
@@ -109,7 +109,7 @@ def test_bad_input_is_one_line(tmp_path: Path, log: Path, capsys: pytest.Capture
     damaged.write_bytes(data)
     foreign.write_text("no log at all")
     empty.write_bytes(b"")
-    cert, key = self_signed(tmp_path)
+    cert, key, _ = certificate(tmp_path)
     for arguments, why in (
         ([str(tmp_path / "nofile.mcap")], "nofile.mcap: cannot be read: No such file"),
         ([str(damaged)], f"{damaged}: damaged"),

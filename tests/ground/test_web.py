@@ -18,7 +18,7 @@ from companion.ground.station.station import Station
 from companion.ground.station.web import Monitor, ServerSettings
 from companion.ground.station.web_guard import HEADERS, MESSAGE_MAX_BYTES
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import OPERATORS, SIGNER, base_of, monitor_at, on_page, self_signed, until, viewer_of
+from tests.ground.monitor_rig import OPERATORS, SIGNER, base_of, certificate, monitor_at, on_page, until, viewer_of
 from tests.ground.vehicle import flight, played_vehicle
 
 
@@ -160,10 +160,10 @@ def test_other_computers_command_over_tls_only(host: str, tls: bool, commands: b
 
 
 async def test_the_page_over_tls(broker: Broker, tmp_path: Path) -> None:
-    cert, key = self_signed(tmp_path)
+    cert, key, ca = certificate(tmp_path)
     server = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     server.load_cert_chain(cert, key)
-    trusting = ssl.create_default_context(cafile=str(cert))
+    trusting = ssl.create_default_context(cafile=str(ca))
 
     async with (
         played_vehicle(broker.port, OPERATORS),

@@ -24,7 +24,7 @@ from companion.io.px4.frames import AutopilotHeartbeat
 from companion.model.types import MocapPose
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
-from tests.io.test_px4 import edge, refused
+from tests.io.test_px4 import armed, edge, refused
 from tests.support import DEADLINE_S, eventually, free_udp_port
 from tests.wires import serial_line
 
@@ -202,19 +202,18 @@ async def test_a_stranger_in_px4s_name_changes_nothing_and_is_reported_once() ->
             assert autopilot.identity().peer == px4.address
             await eventually(lambda: autopilot.status() is not None, "a heartbeat")
             texts: list[str] = []
-            armed: list[bool] = []
+            seen: list[bool] = []
 
             def forged() -> bool:
                 stranger.sendto(forged_heartbeat(), ("127.0.0.1", port))
                 texts.extend(autopilot.take_messages())
-                status = autopilot.status()
-                armed.append(status is not None and status.armed)
-                return len(armed) > 100
+                seen.append(armed(autopilot))
+                return len(seen) > 100
 
             await eventually(forged, "a hundred forged heartbeats")
             _, at = stranger.getsockname()
             assert [text for text in texts if f":{at} claims to be PX4 (system 1)" in text] == texts
-            assert (len(texts), any(armed)) == (1, False)
+            assert (len(texts), any(seen)) == (1, False)
 
 
 async def test_px4_that_a_router_moved_to_another_port_is_heard_there() -> None:
@@ -232,13 +231,12 @@ async def test_px4_that_a_router_moved_to_another_port_is_heard_there() -> None:
                 moved.base_mode = ARMED
                 texts: list[str] = []
 
-                def armed() -> bool:
+                def heard() -> bool:
                     elsewhere.sendto(forged_heartbeat(), ("127.0.0.1", port))
                     texts.extend(autopilot.take_messages())
-                    status = autopilot.status()
-                    return status is not None and status.armed
+                    return armed(autopilot)
 
-                await eventually(armed, "PX4 is heard at its new port")
+                await eventually(heard, "PX4 is heard at its new port")
                 assert autopilot.identity().peer == moved.address
                 reports = [text for text in texts if "the link uses that port" in text]
                 assert len(reports) == 1 and f"now sends from port {moved.address[1]}" in reports[0]
@@ -273,9 +271,4 @@ async def test_px4_that_restarts_at_the_same_address_is_heard_again() -> None:
                 await asyncio.sleep(0.005)
             with Px4Peer(port, at=where) as again:
                 again.base_mode = ARMED
-
-                def armed() -> bool:
-                    status = autopilot.status()
-                    return status is not None and status.armed
-
-                await eventually(armed, "PX4 is heard after its restart")
+                await eventually(lambda: armed(autopilot), "PX4 is heard after its restart")

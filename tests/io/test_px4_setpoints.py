@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Literal, get_args
+from collections.abc import Callable, Iterator
+from typing import Literal, get_args
 
 import pytest
 from mavsdk.plugins.offboard.offboard import Attitude
@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.config.devices import AutopilotDevice
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.px4.setpoints import DirectSetpoints, OffboardSetpoints
-from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
+from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import AttitudeSetpoint, FlightMode
 from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
@@ -111,85 +111,44 @@ def test_a_setpoint_that_the_link_does_not_take_counts_as_not_sent() -> None:
             raise result
         return result
 
-    path = path_with(lambda setpoint: [setpoint], write)
+    path = path_with(write)
     assert [path.send(LEVEL, 0.0) for _ in range(4)] == [True, False, True, False]
 
 
-def test_a_repetition_of_the_setpoint_before_does_not_leave_in_place_of_the_new_one() -> None:
-    """A thread of the plugin repeats at 20 Hz: its frame may come between the call and the new frame."""
-    before: list[AttitudeSetpoint] = [LEVEL]
-    sent: list[float] = []
-
-    def frames(setpoint: AttitudeSetpoint) -> list[AttitudeSetpoint]:
-        before.append(setpoint)
-        return before[-2:]
-
-    def write(frame: bytes) -> bool:
-        sent.append(parsed(frame).thrust)
-        return True
-
-    path = path_with(frames, write)
-    tilted = quat_from_euler_zyx(0.1, -0.2, 2.0)
-    for k in range(5):
-        assert path.send(AttitudeSetpoint(tilted, 0.25 + 0.125 * k), 0.0)
-    assert sent == [0.25 + 0.125 * k for k in range(5)]
-
-
-def test_in_simulated_time_not_even_a_repetition_that_is_nearly_the_new_one_leaves(
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.parametrize(("simulated", "step"), [(False, 0.0625), (True, 2**-15)])
+def test_a_repetition_of_the_setpoint_before_does_not_leave_in_place_of_the_new_one(
+    monkeypatch: pytest.MonkeyPatch, simulated: bool, step: float
 ) -> None:
-    """The plugin repeats what it holds by the computer's clock: a flight would depend on how busy the computer is."""
-    monkeypatch.setattr("companion.io.px4.setpoints.simulated_time.current", lambda: object())
+    """A thread of the plugin repeats at 20 Hz of the computer's clock: its frame may come between the call and the new frame. In
+    simulated time not even one that is nearly the new one leaves: a flight would depend on how busy the computer is.
+    """
+    if simulated:
+        monkeypatch.setattr("companion.io.px4.setpoints.simulated_time.current", lambda: object())
     sent: list[float] = []
 
     def write(frame: bytes) -> bool:
-        sent.append(parsed(frame).thrust)
+        sent.append(mavlink.MAVLink(None).parse_char(frame).thrust)
         return True
 
-    path = OffboardSetpoints(None, write, DirectSetpoints(lambda number, payload: False, 1))
-
-    class Plugin:
-        """Its thread repeats before each new attitude."""
-
-        held = Attitude(0.0, 0.0, 0.0, 0.0)
-
-        def set_attitude(self, attitude: Attitude) -> None:
-            for one in (self.held, attitude):
-                q = quat_from_euler_zyx(*(math.radians(deg) for deg in (one.roll_deg, one.pitch_deg, one.yaw_deg)))
-                message = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0.0, 0.0, 0.0, one.thrust_value)
-                path.pass_on(bytes(message.pack(mavlink.MAVLink(None))))
-            self.held = attitude
-
-    path._plugin = Plugin()
-    thrusts = [0.5 + 2**-15 * k for k in range(5)]
-    for thrust in thrusts:
-        assert path.send(AttitudeSetpoint(LEVEL.attitude_wxyz, thrust), 0.0)
+    path, thrusts = path_with(write, repeats=True), [0.5 + step * k for k in range(5)]
+    assert all(path.send(AttitudeSetpoint(quat_from_euler_zyx(0.1, -0.2, 2.0), thrust), 0.0) for thrust in thrusts)
     assert sent == thrusts
 
 
-def parsed(frame: bytes) -> Any:
-    return mavlink.MAVLink(None).parse_char(frame)
-
-
-def path_with(
-    frames: Callable[[AttitudeSetpoint], Sequence[AttitudeSetpoint]], write: Callable[[bytes], bool]
-) -> OffboardSetpoints:
-    """Return a path whose plugin sends the given setpoints when it is given one, as frames that MAVSDK would send."""
-    now: list[AttitudeSetpoint] = []
+def path_with(write: Callable[[bytes], bool], repeats: bool = False) -> OffboardSetpoints:
+    """Return a path whose plugin sends what it is given as MAVSDK does, or repeats what it holds before each new attitude."""
 
     class Plugin:
-        def set_attitude(self, attitude: object) -> None:
-            for setpoint in frames(now[-1]):
-                q = attitude_ned_frd_from_enu_flu(setpoint.attitude_wxyz)
-                message = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0.0, 0.0, 0.0, setpoint.thrust)
+        held = Attitude(0.0, 0.0, 0.0, 0.0)
+
+        def set_attitude(self, attitude: Attitude) -> None:
+            for one in (self.held, attitude) if repeats else (attitude,):
+                q = quat_from_euler_zyx(*map(math.radians, (one.roll_deg, one.pitch_deg, one.yaw_deg)))
+                message = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0.0, 0.0, 0.0, one.thrust_value)
                 with contextlib.suppress(OSError):
                     path.pass_on(bytes(message.pack(mavlink.MAVLink(None))))
+            self.held = attitude
 
-    class Path(OffboardSetpoints):
-        def send(self, setpoint: AttitudeSetpoint, t_s: float) -> bool:
-            now.append(setpoint)
-            return super().send(setpoint, t_s)
-
-    path = Path(None, write, DirectSetpoints(lambda number, payload: True, 1))
+    path = OffboardSetpoints(None, write, DirectSetpoints(lambda number, payload: False, 1))
     path._plugin = Plugin()
     return path

@@ -28,12 +28,13 @@ def packed(message: Any, system: int = 255, component: int = 190, *, v1: bool = 
     return data
 
 
-def command(number: int) -> Any:
-    return mavlink.MAVLink_command_long_message(VEHICLE, 1, number, 0, *[0.0] * 7)
+def long(number: int, *params: float) -> Any:
+    return mavlink.MAVLink_command_long_message(VEHICLE, 1, number, 0, *params, *[0.0] * (7 - len(params)))
 
 
-def command_int(number: int) -> Any:
-    return mavlink.MAVLink_command_int_message(VEHICLE, 1, 0, number, 0, 0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0.0)
+def integer(number: int, *params: float) -> Any:
+    four = [*params, *[0.0] * (4 - len(params))]
+    return mavlink.MAVLink_command_int_message(VEHICLE, 1, 0, number, 0, 0, *four, 0, 0, 0.0)
 
 
 def px4_heartbeat(*, armed: bool, system: int = VEHICLE) -> bytes:
@@ -59,7 +60,7 @@ def signed(message: Any) -> bytes:
     "data",
     [
         *(packed(_HEARTBEAT), packed(_READ), packed(_READ, v1=True), signed(_READ)),
-        *(packed(command(mavlink.MAV_CMD_NAV_LAND)), packed(command_int(mavlink.MAV_CMD_DO_SET_MODE))),
+        *(packed(long(mavlink.MAV_CMD_NAV_LAND)), packed(integer(mavlink.MAV_CMD_DO_SET_MODE))),
         packed(mavlink.MAVLink_set_mode_message(VEHICLE, 1, 3 << 16)),
         packed(mavlink.MAVLink_param_set_message(VEHICLE, 1, b"MPC_XY_VEL_MAX", 2.0, 9)),
     ],
@@ -68,15 +69,6 @@ def test_what_a_ground_station_says_passes_unchanged(data: bytes) -> None:
     uplink = uplink_of(armed=False)
     assert uplink.admit(data, 0.0) == [data]
     assert not uplink.refused
-
-
-def long(number: int, *params: float) -> Any:
-    return mavlink.MAVLink_command_long_message(VEHICLE, 1, number, 0, *params, *[0.0] * (7 - len(params)))
-
-
-def integer(number: int, *params: float) -> Any:
-    four = [*params, *[0.0] * (4 - len(params))]
-    return mavlink.MAVLink_command_int_message(VEHICLE, 1, 0, number, 0, 0, *four, 0, 0, 0.0)
 
 
 def set_mode(main: int, sub: int, base_mode: int = 1) -> Any:
@@ -225,9 +217,9 @@ def test_nothing_passes_in_the_vehicles_name(message: Any, system: int, componen
         mavlink.MAVLink_request_data_stream_message(VEHICLE, 1, 0, 1, 0),
         mavlink.MAVLink_timesync_message(0, 1),
         mavlink.MAVLink_command_ack_message(400, 0),
-        command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL),
-        command_int(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL),
-        command(43003),
+        long(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL),
+        integer(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL),
+        long(43003),
     ],
     ids=lambda message: message.get_type(),
 )

@@ -81,6 +81,18 @@ async def link(port: int, address: str) -> AsyncIterator[tuple[MavsdkAutopilot, 
         yield autopilot, station
 
 
+@asynccontextmanager
+async def stationed(
+    *, beating: bool = True, armed: bool = False
+) -> AsyncIterator[tuple[GroundPeer, Px4Peer, MavsdkAutopilot, GroundStation]]:
+    """A ground station, a scripted PX4 and what is between them."""
+    port = free_udp_port()
+    with GroundPeer(beating) as ground, Px4Peer(port) as px4:
+        px4.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
+        async with link(port, ground.address) as (autopilot, station):
+            yield ground, px4, autopilot, station
+
+
 async def send_setpoints(autopilot: MavsdkAutopilot, px4: Px4Peer, count: int, each: Callable[[int], None]) -> None:
     """In portions that PX4's socket holds, so that what does not arrive was not sent."""
     for tick in range(count):
@@ -133,25 +145,22 @@ async def test_qgroundcontrol_sees_the_stub_reads_a_parameter_hears_our_words_an
 
 
 async def test_a_forced_disarm_from_the_ground_does_not_reach_an_armed_px4() -> None:
-    port = free_udp_port()
-    with GroundPeer() as ground, Px4Peer(port) as px4:
-        px4.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-        async with link(port, ground.address) as (_, station):
-            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
-            ground.say(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 0.0, 21196.0, *[0.0] * 5))
-            ground.say(mavlink.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, 0.0, 21196.0, 0.0, 0.0, 0, 0, 0.0))
-            ground.say(mavlink.MAVLink_command_long_message(1, 1, 21, 0, *[0.0] * 7))
-            await eventually(lambda: bool(px4.commands(21)), "LAND, which was sent after them")
-            assert px4.commands(400) == []
-            assert [message for message in px4.of("COMMAND_INT") if message.command == 400] == []
-            texts: list[str] = []
+    async with stationed(armed=True) as (ground, px4, _, station):
+        await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1, autopilot=mavlink.MAV_AUTOPILOT_PX4)
+        ground.say(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 0.0, 21196.0, *[0.0] * 5))
+        ground.say(mavlink.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, 0.0, 21196.0, 0.0, 0.0, 0, 0, 0.0))
+        ground.say(mavlink.MAVLink_command_long_message(1, 1, 21, 0, *[0.0] * 7))
+        await eventually(lambda: bool(px4.commands(21)), "LAND, which was sent after them")
+        assert px4.commands(400) == []
+        assert [message for message in px4.of("COMMAND_INT") if message.command == 400] == []
+        texts: list[str] = []
 
-            def both_are_reported() -> bool:
-                """In one line, or in two if the relay reported between them."""
-                texts.extend(station.take_messages())
-                return sum(map(int, re.findall(r"(\d+) command 400 while PX4 is armed", " ".join(texts)))) == 2
+        def both_are_reported() -> bool:
+            """In one line, or in two if the relay reported between them."""
+            texts.extend(station.take_messages())
+            return sum(map(int, re.findall(r"(\d+) command 400 while PX4 is armed", " ".join(texts)))) == 2
 
-            await eventually(both_are_reported, "the two refusals")
+        await eventually(both_are_reported, "the two refusals")
 
 
 def _forgeries() -> list[Any]:
@@ -215,63 +224,56 @@ async def test_nothing_that_the_ground_forges_enters_the_companions_state() -> N
 
 
 async def test_px4_never_hears_the_companions_words_and_no_station_in_its_name() -> None:
-    port = free_udp_port()
-    with GroundPeer(beating=False) as ground, Px4Peer(port) as px4:
-        px4.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED  # in the air
-        async with link(port, ground.address) as (autopilot, station):
-            for tick in range(200):
-                station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
-            await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191)
-            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
-            assert autopilot.send_attitude(LEVEL)
-            await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET")
-            heard = {(m.get_srcSystem(), m.get_srcComponent()) for m in px4.received}
-            assert heard == {(1, 195)}
-            assert mavlink.MAV_TYPE_GCS not in {m.type for m in px4.of("HEARTBEAT")}
+    async with stationed(beating=False, armed=True) as (ground, px4, autopilot, station):
+        for tick in range(200):
+            station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
+        await asyncio.to_thread(ground.wait_for, "NAMED_VALUE_FLOAT", 191)
+        await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
+        assert autopilot.send_attitude(LEVEL)
+        await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET")
+        heard = {(m.get_srcSystem(), m.get_srcComponent()) for m in px4.received}
+        assert heard == {(1, 195)}
+        assert mavlink.MAV_TYPE_GCS not in {m.type for m in px4.of("HEARTBEAT")}
 
 
 async def test_a_flood_is_cut_down_and_setpoints_pass() -> None:
-    port = free_udp_port()
-    with GroundPeer() as ground, Px4Peer(port) as px4:
-        async with link(port, ground.address) as (autopilot, station):
-            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
-            start_s = time.monotonic()
+    async with stationed() as (ground, px4, autopilot, station):
+        await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
+        start_s = time.monotonic()
 
-            def flood() -> None:
-                for i in range(6000):
-                    ground.say(mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH_NAME", -1))
-                    ground.say_bytes(bytes(range(i % 256)))
+        def flood() -> None:
+            for i in range(6000):
+                ground.say(mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH_NAME", -1))
+                ground.say_bytes(bytes(range(i % 256)))
 
-            flooding = asyncio.create_task(asyncio.to_thread(flood))
-            sent = 0
-            while not flooding.done():
-                assert autopilot.send_attitude(LEVEL)
-                sent += 1
-                await asyncio.sleep(0.005)
-            await flooding
-            await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET", sent)
-            # A parameter is read as soon as the flood is over.
-            value = None
-            async with asyncio.timeout(DEADLINE_S):
-                while value is None:
-                    ground.say(mavlink.MAVLink_param_request_read_message(1, 1, b"MPC_THR_HOVER", -1))
-                    await asyncio.sleep(0.05)
-                    value = next(iter(ground.of("PARAM_VALUE")), None)
-            passed = sum(m.param_id == "NO_SUCH_NAME" for m in px4.of("PARAM_REQUEST_READ"))
-            assert 0 < passed <= UP_BURST + UP_RATE_HZ * (time.monotonic() - start_s)
-            assert len(px4.of("SET_ATTITUDE_TARGET")) == sent
-            assert any("refused" in line for line in station.take_messages())
+        flooding = asyncio.create_task(asyncio.to_thread(flood))
+        sent = 0
+        while not flooding.done():
+            assert autopilot.send_attitude(LEVEL)
+            sent += 1
+            await asyncio.sleep(0.005)
+        await flooding
+        await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET", sent)
+        # A parameter is read as soon as the flood is over.
+        value = None
+        async with asyncio.timeout(DEADLINE_S):
+            while value is None:
+                ground.say(mavlink.MAVLink_param_request_read_message(1, 1, b"MPC_THR_HOVER", -1))
+                await asyncio.sleep(0.05)
+                value = next(iter(ground.of("PARAM_VALUE")), None)
+        passed = sum(m.param_id == "NO_SUCH_NAME" for m in px4.of("PARAM_REQUEST_READ"))
+        assert 0 < passed <= UP_BURST + UP_RATE_HZ * (time.monotonic() - start_s)
+        assert len(px4.of("SET_ATTITUDE_TARGET")) == sent
+        assert any("refused" in line for line in station.take_messages())
 
 
 async def test_a_ground_station_that_connects_late_receives_the_phase() -> None:
-    port, ground = free_udp_port(), GroundPeer(beating=False)
-    with ground, Px4Peer(port):
-        async with link(port, ground.address) as (_, station):
-            station.report_tick(inputs(), outputs(phase="catch"))
-            await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase catch")
-            assert len(ground.of("STATUSTEXT", 191)) == 1
-            ground.beating = True
-            await eventually(lambda: len(ground.of("STATUSTEXT", 191)) == 2, "the phase again")
+    async with stationed(beating=False) as (ground, _, _, station):
+        station.report_tick(inputs(), outputs(phase="catch"))
+        await asyncio.to_thread(ground.wait_for, "STATUSTEXT", 191, text="phase catch")
+        assert len(ground.of("STATUSTEXT", 191)) == 1
+        ground.beating = True
+        await eventually(lambda: len(ground.of("STATUSTEXT", 191)) == 2, "the phase again")
 
 
 async def test_without_any_ground_station_the_link_to_px4_is_as_ever() -> None:
@@ -284,49 +286,45 @@ async def test_without_any_ground_station_the_link_to_px4_is_as_ever() -> None:
 
 
 async def test_a_relay_that_was_killed_costs_the_ground_station_and_nothing_else() -> None:
-    port = free_udp_port()
-    with GroundPeer() as ground, Px4Peer(port) as px4:
-        async with link(port, ground.address) as (autopilot, station):
-            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
-            assert station.relay_pid is not None
-            os.kill(station.relay_pid, signal.SIGKILL)
-            reports: list[str] = []
+    async with stationed() as (ground, px4, autopilot, station):
+        await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
+        assert station.relay_pid is not None
+        os.kill(station.relay_pid, signal.SIGKILL)
+        reports: list[str] = []
 
-            def each(tick: int) -> None:
-                station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
-                reports.extend(station.take_messages())
+        def each(tick: int) -> None:
+            station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}"))
+            reports.extend(station.take_messages())
 
-            await send_setpoints(autopilot, px4, 400, each)
-            assert await autopilot.read_param("COM_RC_IN_MODE") == 4
+        await send_setpoints(autopilot, px4, 400, each)
+        assert await autopilot.read_param("COM_RC_IN_MODE") == 4
 
-            def reported() -> bool:
-                reports.extend(station.take_messages())
-                return any("relay has ended" in line for line in reports)
+        def reported() -> bool:
+            reports.extend(station.take_messages())
+            return any("relay has ended" in line for line in reports)
 
-            # A killed process ends when the kernel comes to it.
-            await eventually(reported, "the relay's end")
-            assert [line for line in reports if "relay has ended" in line] == [
-                f"ground station {ground.address}: the relay has ended; nothing is forwarded"
-            ]
+        # A killed process ends when the kernel comes to it.
+        await eventually(reported, "the relay's end")
+        assert [line for line in reports if "relay has ended" in line] == [
+            f"ground station {ground.address}: the relay has ended; nothing is forwarded"
+        ]
 
 
 async def test_a_stopped_relay_blocks_no_other_program() -> None:
-    port = free_udp_port()
-    with GroundPeer() as ground, Px4Peer(port) as px4:
-        async with link(port, ground.address) as (autopilot, station):
-            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
-            assert station.relay_pid is not None
-            os.kill(station.relay_pid, signal.SIGSTOP)
-            try:
-                # More than its sockets hold.
-                await send_setpoints(
-                    *(autopilot, px4, 2000),
-                    lambda tick: station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}")),
-                )
-            finally:
-                os.kill(station.relay_pid, signal.SIGCONT)
-            station.report_tick(inputs(2000), outputs(2000, phase="landing"))
-            await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
+    async with stationed() as (ground, px4, autopilot, station):
+        await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
+        assert station.relay_pid is not None
+        os.kill(station.relay_pid, signal.SIGSTOP)
+        try:
+            # More than its sockets hold.
+            await send_setpoints(
+                *(autopilot, px4, 2000),
+                lambda tick: station.report_tick(inputs(tick), outputs(tick, phase=f"phase{tick}")),
+            )
+        finally:
+            os.kill(station.relay_pid, signal.SIGCONT)
+        station.report_tick(inputs(2000), outputs(2000, phase="landing"))
+        await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 191)
 
 
 class NoForwarder:

@@ -15,27 +15,6 @@ def pytest_of(path: Path) -> tuple[str, ...]:
     return (sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", str(path.parent), str(path))
 
 
-GROUP = """
-import os, time
-import pytest
-
-@pytest.mark.xdist_group("a world")
-@pytest.mark.parametrize("number", range(3))
-def test_shares(number):
-    time.sleep(0.2)
-    with open("workers", "a") as file:
-        print(os.environ["PYTEST_XDIST_WORKER"], file=file)
-"""
-
-
-def test_tests_of_a_group_share_one_worker(tmp_path: Path) -> None:
-    """And with it what their fixtures have made: pytest-xdist loses its groups, unnoticed, with a pytest that it does not know."""
-    path = tmp_path / "test_group.py"
-    path.write_text(GROUP, encoding="utf-8")
-    subprocess.run((*pytest_of(path), "-n", "2", "--dist", "loadgroup"), cwd=tmp_path, check=True)
-    assert len(set((tmp_path / "workers").read_text(encoding="utf-8").splitlines())) == 1
-
-
 DRAWS = """
 import os, pathlib
 from hypothesis import given, strategies as st

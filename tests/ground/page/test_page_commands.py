@@ -188,12 +188,6 @@ def test_a_long_press_ends_with_the_permission(stub: MonitorStub, page: Page) ->
     assert asked(stub, 1) == ["land"]
 
 
-def test_a_vehicle_that_hears_no_commands_says_so(page: Page) -> None:
-    page.show(relayed(state(commands=False, text="commands are disabled in the vehicle file")))
-    assert page.enabled() == set()
-    assert page.text("#commands-why") == "commands are disabled in the vehicle file"
-
-
 def _hold_start(page: Page, seconds: float, news: Callable[[], Message]) -> None:
     """Hold START down while the vehicle keeps sending."""
     page.tab.hover("[data-command='start']")
