@@ -10,45 +10,36 @@ from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.registers import cycle_bytes, cycle_s
 from sitl.servo.bus import ServoLine
 from sitl.servo.model import ServoModel
+from tests.fuzz.dynamixel import MemoryPort, MemorySerial
 
 ANSWER_BYTES = packets.STATUS_BYTES + dxl.BLOCK_SIZE
 
 
-class CountingPort:
-    """A port of the SDK whose wire ends at emulated servos; counts the bytes in both directions."""
+class Line(MemorySerial):
+    """A line with emulated servos; keeps what was sent and answered."""
 
     def __init__(self, count: int) -> None:
-        self._line = ServoLine([ServoModel(servo_id) for servo_id in range(1, count + 1)])
-        self.answer = b""
-        self.is_using = False
-        self.bytes = 0
+        super().__init__()
+        self.answer = ServoLine([ServoModel(servo_id) for servo_id in range(1, count + 1)]).feed
         self.sent: list[bytes] = []
+        self.answers: list[bytes] = []
 
-    def writePort(self, packet: list[int]) -> int:
-        self.sent.append(bytes(packet))
-        self.answer += self._line.feed(bytes(packet))
-        self.bytes += len(packet)
-        return len(packet)
-
-    def readPort(self, length: int) -> bytes:
-        data, self.answer = self.answer[:length], self.answer[length:]
-        self.bytes += len(data)
-        return data
-
-    def clearPort(self) -> None: ...
-
-    def setPacketTimeout(self, _: int) -> None: ...
-
-    def isPacketTimeout(self) -> bool:
-        return False
+    def write(self, sent: list[int] | bytes) -> int:
+        before = len(self._waiting)
+        written = super().write(sent)
+        self.sent.append(bytes(sent))
+        self.answers.append(bytes(self._waiting[before:]))
+        return written
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
 def test_a_cycle_has_the_computed_number_of_bytes_and_is_that_of_the_sdk(count: int) -> None:
-    port, protocol, ids = CountingPort(count), PacketHandler(2.0), list(range(1, count + 1))
+    line, protocol, ids = Line(count), PacketHandler(2.0), list(range(1, count + 1))
+    port = MemoryPort(line)
+    port.setupPort(57_600)
     assert protocol.syncReadTx(port, dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, ids, count, False) == COMM_SUCCESS
-    assert port.sent[-1] == packets.sync_read(dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, ids)
-    answers = port.answer
+    assert line.sent[-1] == packets.sync_read(dxl.INDIRECT_DATA_1, dxl.BLOCK_SIZE, ids)
+    answers = line.answers[-1]
     for i, servo_id in enumerate(ids):
         data, result, error = protocol.readRx(port, servo_id, dxl.BLOCK_SIZE)
         assert (len(data), result) == (dxl.BLOCK_SIZE, COMM_SUCCESS)
@@ -65,8 +56,8 @@ def test_a_cycle_has_the_computed_number_of_bytes_and_is_that_of_the_sdk(count: 
     goals = [-1 - servo_id for servo_id in ids]
     parameters = [value for i, goal in zip(ids, goals, strict=True) for value in (i, goal & 0xFF, goal >> 8 & 0xFF)]
     protocol.syncWriteTxOnly(port, dxl.GOAL_CURRENT.address, dxl.GOAL_CURRENT.size, parameters, len(parameters))
-    assert port.sent[-1] == packets.sync_write_int16(dxl.GOAL_CURRENT.address, ids, goals)
-    assert port.bytes == cycle_bytes(count)
+    assert line.sent[-1] == packets.sync_write_int16(dxl.GOAL_CURRENT.address, ids, goals)
+    assert sum(map(len, line.sent + line.answers)) == cycle_bytes(count)
 
 
 def test_seven_servos_at_the_factory_rate_take_eight_control_ticks() -> None:
