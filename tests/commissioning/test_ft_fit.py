@@ -14,8 +14,6 @@ from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_mul
 from companion.model.types import ForceSample, Joints, Quat, Vec3
 from companion.preflight import force as preflight
 from companion.preflight.axes import IDENTITY, ROTATIONS, AxisMap
-from companion.sitl_config.world import World
-from sitl.world.handling import HungWeight
 from tests.machines import overrides_with_joints
 from tests.support import ROOT
 
@@ -142,13 +140,6 @@ def test_a_sensor_that_repeats_itself_is_stuck() -> None:
     row = preflight.stuck_row(stream(alive), VEHICLE)
     assert not row.ok
     assert "0.39 s" in row.read or "0.40 s" in row.read
-
-
-def test_the_simulated_weight_is_on_the_net_while_the_sensor_is_read() -> None:
-    hung = HungWeight(World(net_weight_kg=0.5, net_weight_t_s=2.0))
-    reads = ((0.0, False), (1.0, True), (2.9, True), (3.0, True), (9.0, True), (9.1, False), (9.2, True))
-    pulls_n = [hung.pull_n(t_s, read) for t_s, read in reads]
-    assert pulls_n == pytest.approx([0.0, 0.0, 0.0, 4.905, 4.905, 0.0, 0.0])
 
 
 def test_drift_is_computed_from_samples_that_arrive_in_one_burst() -> None:

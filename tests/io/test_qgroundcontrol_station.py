@@ -11,7 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from functools import partial
@@ -29,7 +28,6 @@ from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.qgroundcontrol.channel import pack, unpack
 from companion.io.qgroundcontrol.relay import GONE
 from companion.io.qgroundcontrol.station import GroundStation, check_address
-from companion.io.qgroundcontrol.uplink_filter import UP_BURST, UP_RATE_HZ
 from companion.model.outputs import Outputs
 from companion.model.types import (
     AttitudeSetpoint,
@@ -236,37 +234,6 @@ async def test_px4_never_hears_the_companions_words_and_no_station_in_its_name()
         assert mavlink.MAV_TYPE_GCS not in {m.type for m in px4.of("HEARTBEAT")}
 
 
-async def test_a_flood_is_cut_down_and_setpoints_pass() -> None:
-    async with stationed() as (ground, px4, autopilot, station):
-        await asyncio.to_thread(ground.wait_for, "HEARTBEAT", 1)
-        start_s = time.monotonic()
-
-        def flood() -> None:
-            for i in range(6000):
-                ground.say(mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH_NAME", -1))
-                ground.say_bytes(bytes(range(i % 256)))
-
-        flooding = asyncio.create_task(asyncio.to_thread(flood))
-        sent = 0
-        while not flooding.done():
-            assert autopilot.send_attitude(LEVEL)
-            sent += 1
-            await asyncio.sleep(0.005)
-        await flooding
-        await asyncio.to_thread(px4.wait_for, "SET_ATTITUDE_TARGET", sent)
-        # A parameter is read as soon as the flood is over.
-        value = None
-        async with asyncio.timeout(DEADLINE_S):
-            while value is None:
-                ground.say(mavlink.MAVLink_param_request_read_message(1, 1, b"MPC_THR_HOVER", -1))
-                await asyncio.sleep(0.05)
-                value = next(iter(ground.of("PARAM_VALUE")), None)
-        passed = sum(m.param_id == "NO_SUCH_NAME" for m in px4.of("PARAM_REQUEST_READ"))
-        assert 0 < passed <= UP_BURST + UP_RATE_HZ * (time.monotonic() - start_s)
-        assert len(px4.of("SET_ATTITUDE_TARGET")) == sent
-        assert any("refused" in line for line in station.take_messages())
-
-
 async def test_a_ground_station_that_connects_late_receives_the_phase() -> None:
     async with stationed(beating=False) as (ground, _, _, station):
         station.report_tick(inputs(), outputs(phase="catch"))
@@ -274,15 +241,6 @@ async def test_a_ground_station_that_connects_late_receives_the_phase() -> None:
         assert len(ground.of("STATUSTEXT", 191)) == 1
         ground.beating = True
         await eventually(lambda: len(ground.of("STATUSTEXT", 191)) == 2, "the phase again")
-
-
-async def test_without_any_ground_station_the_link_to_px4_is_as_ever() -> None:
-    port, unheard = free_udp_port(), free_udp_port()
-    with Px4Peer(port) as px4:
-        async with link(port, f"udpout://localhost:{unheard}") as (autopilot, station):
-            await send_setpoints(autopilot, px4, 200, lambda tick: station.report_tick(inputs(tick), outputs(tick)))
-            assert await autopilot.read_param("COM_RC_IN_MODE") == 4
-            assert station.take_messages() == []
 
 
 async def test_a_relay_that_was_killed_costs_the_ground_station_and_nothing_else() -> None:
