@@ -86,12 +86,7 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("fly", "cath", "--sitl"),
         (r"^mission cath: expected carry, catch, circuit, .* or a file, found neither \(did you mean catch\?\)$",),
     ),
-    "the shipped vehicle file is not written": (
-        ("arm", "scan", "--write"),
-        (r"^companion arm: --write: tarot650_2r is part of the installation; .*companion init",),
-    ),
     "copies over existing files": (("init", "."), (r"^companion init: \. exists; .*nothing was written$",)),
-    "mission is a directory": (("fly", ".", "--sitl"), (r"^\.: is a directory, expected a YAML file",)),
     "unknown world": (("fly", "mission.yaml", "--sitl=moon"), (r"^companion fly: --sitl=moon: expected",)),
     "bad preset": ((*FLY, "--preset", "papr"), (r"--preset papr: .*paper, .*recommended",)),
     "negative seed": ((*FLY, "--seed=-1"), (r"^companion fly: argument --seed: expected a whole number from 0",)),

@@ -162,24 +162,6 @@ def test_parameters_that_nobody_could_read_keep_the_machine_down() -> None:
     assert rows(None, {}, vehicle()) == []
 
 
-def test_a_wrong_parameter_over_real_mavlink_gives_its_row() -> None:
-    wrong = {"EKF2_EV_CTRL": 3.0, "COM_OBL_RC_ACT": 6.0, "COM_OF_LOSS_T": 5.0, "CA_ROTOR1_KM": -0.025}
-    geometry = geometry_of(vehicle().airframe)
-    world, _ = load_world([f"world.px4_params={wrong}".replace("'", "")])
-
-    async def read() -> list[Row]:
-        port = free_udp_port()
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
-        async with (
-            standing_stub(port, {HOVER: 0.49, **geometry, **world.overridden_px4_params()}),
-            MavsdkAutopilot(device, flight_clock()) as autopilot,
-        ):
-            return rows(await autopilot.firmware(), await autopilot.read_params(param_names(vehicle())), vehicle())
-
-    found = {row.title for row in asyncio.run(read()) if not row.ok}
-    assert found == {"EKF2_EV_CTRL", "COM_OBL_RC_ACT", "COM_OF_LOSS_T", "rotors in PX4"}
-
-
 def test_a_parameter_that_changes_while_the_flight_waits_refuses_the_start_until_it_is_set_back() -> None:
     async def answers() -> list[str]:
         port = free_udp_port()
