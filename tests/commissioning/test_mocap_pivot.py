@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli.main import main
 from companion.commissioning.mocap.pivot import Probed, TooAlike, tip_off_m
 from companion.config.loader import load_flight
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_REFUSED
+from tests.commands import companion, refused
 
 LEAN = math.radians(15.0)
 WALL, LEANED = (-1.0, 0.0, 0.0), (-math.cos(LEAN), 0.0, math.sin(LEAN))
@@ -65,22 +65,20 @@ VERTICAL = "--plane=1.5,0,1,-1,0,0"
 PLANES = [VERTICAL, VERTICAL, f"--plane=1.5,0,1,{LEANED[0]},0,{LEANED[2]}"]
 
 
-def test_the_command_prints_how_to_move_the_pivot(flights: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["mocap", "pivot", *flights, *PLANES]) == EXIT_REFUSED
-    out = capsys.readouterr().out
+def test_the_command_prints_how_to_move_the_pivot(flights: list[str]) -> None:
+    out = companion("mocap", "pivot", *flights, *PLANES, code=EXIT_REFUSED).out
     assert "24.4 mm off" in out
     assert "move the pivot by -12.0 mm forward, +7.0 mm to the left and -20.0 mm up" in out
-    assert main(["mocap", "pivot", *flights, *PLANES, "--json"]) == EXIT_REFUSED
-    assert json.loads(capsys.readouterr().out)["pivot_move_mm"] == pytest.approx([-12.0, 7.0, -20.0])
+    found = json.loads(companion("mocap", "pivot", *flights, *PLANES, "--json", code=EXIT_REFUSED).out)
+    assert found["pivot_move_mm"] == pytest.approx([-12.0, 7.0, -20.0])
 
 
-def test_a_pivot_that_is_right_is_ok(flights: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_pivot_that_is_right_is_ok(flights: list[str]) -> None:
     planes = []
     for flight, normal in zip(flights, (WALL, WALL, LEANED), strict=True):
         surface = json.loads((Path(flight) / "summary.json").read_text())["contact"]["surface"]
         planes.append("--plane=" + ",".join(map(str, (*surface["point_m"], *normal))))
-    assert main(["mocap", "pivot", *flights, *planes]) == EXIT_OK
-    assert "0.0 mm off" in capsys.readouterr().out
+    assert "0.0 mm off" in companion("mocap", "pivot", *flights, *planes).out
 
 
 @pytest.mark.parametrize(
@@ -95,19 +93,10 @@ def test_a_pivot_that_is_right_is_ok(flights: list[str], capsys: pytest.CaptureF
         (["left", "right", "leaned", "--plane=1,2,3,0,0,0"], "a normal that is not zero, got '1,2,3,0,0,0'"),
     ],
 )  # fmt: skip
-def test_what_is_not_usable_is_one_line(
-    flights: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], expected: str
-) -> None:
+def test_what_is_not_usable_is_one_line(flights: list[str], tmp_path: Path, words: list[str], expected: str) -> None:
     hover = tmp_path / "hover"
     hover.mkdir()
     (hover / "config.json").write_text(load_flight("hover").model_dump_json())
     (hover / "summary.json").write_text('{"contact": null}')
     given = [word if word.startswith("--") else str(tmp_path / word) for word in words]
-    try:
-        code = main(["mocap", "pivot", *given])
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else -1
-    assert code == EXIT_BAD_INPUT
-    err = capsys.readouterr().err
-    assert expected in err
-    assert "Traceback" not in err
+    assert expected in refused(EXIT_BAD_INPUT, "mocap", "pivot", *given)

@@ -14,15 +14,16 @@ from pathlib import Path
 import pytest
 import yaml
 
-from companion.cli.main import main, make_parser
+from companion.cli.main import make_parser
 from companion.config.ground import Ground
 from companion.ground.broker import setup as broker_setup
 from companion.ground.broker.certificates import certificate_hosts, make_authority, make_server
 from companion.ground.protocol.keys import load_login, load_operators
-from companion.model.exit_codes import EXIT_REFUSED
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.broker import loopback_broker
+from tests.commands import companion, refused
 from tests.ground.test_broker import WANTED, Site, running
-from tests.support import free_port
+from tests.support import Ended, free_port, run_here
 
 ROOMS = ["vehicles/tarot", "vehicles/second", "operators/anna", "operators/bert", "viewers/wall"]
 
@@ -35,11 +36,14 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
     return Site(folder, None, 0, 0)  # type: ignore[arg-type]
 
 
-def test_init_prints_what_to_copy_to_which_computer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def broker(*words: object, code: int = EXIT_OK) -> Ended:
+    return companion("broker", *words, code=code)
+
+
+def test_init_prints_what_to_copy_to_which_computer(tmp_path: Path) -> None:
     folder = tmp_path / "a site"
     words = ["--host", "gcs.lab", "10.0.0.2", "--operator", "anna", "--viewer", "wall", "--vehicle", "tarot", "second"]
-    assert main(["broker", "init", str(folder), *words]) == 0
-    told = capsys.readouterr().out
+    told = broker("init", folder, *words).out
     for room in ("vehicles/tarot", "vehicles/second", "operators/anna", "viewers/wall"):
         assert f"copy {folder}/{room} " in told or f"copy {folder}/{room}." in told
     section = (
@@ -65,8 +69,8 @@ def test_init_prints_what_to_copy_to_which_computer(tmp_path: Path, capsys: pyte
     }
 
 
-def test_init_without_options_makes_one_of_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["broker", "init", str(tmp_path / "site")]) == 0
+def test_init_without_options_makes_one_of_each(tmp_path: Path) -> None:
+    broker("init", tmp_path / "site")
     assert len(list((tmp_path / "site").rglob("login.yaml"))) == 3
     assert (tmp_path / "site/vehicles/tarot650-2r/operators.yaml").is_file()
 
@@ -105,14 +109,13 @@ def test_no_password_is_on_a_command_line(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("inside", ["file", "folder"])
-def test_nothing_is_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str], inside: str) -> None:
+def test_nothing_is_overwritten(tmp_path: Path, inside: str) -> None:
     folder = tmp_path / "site"
     if inside == "file":
         folder.write_text("mine")
     else:
         (folder / "mine").mkdir(parents=True)
-    assert main(["broker", "init", str(folder)]) == 2
-    assert capsys.readouterr().err == (
+    assert broker("init", folder, code=EXIT_BAD_INPUT).err == (
         f"{folder}: already exists; nothing was changed. Choose another folder, or use --renew-certificates\n"
     )
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
@@ -141,51 +144,36 @@ BAD = {
 def test_bad_input_is_one_line_and_leaves_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], line: str
 ) -> None:
-    try:
-        code = main(["broker", "init", str(tmp_path / "site"), *words])
-    except SystemExit as left:
-        code = int(str(left.code))
-    told = capsys.readouterr().err
-    assert code == 2
-    assert told.count("\n") == 1
+    told = refused(EXIT_BAD_INPUT, "broker", "init", tmp_path / "site", *words)
     assert line in told
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missing_mosquitto_passwd_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_mosquitto_passwd_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert main(["broker", "init", str(tmp_path / "site")]) == 3
-    assert capsys.readouterr().err == (
+    assert broker("init", tmp_path / "site", code=EXIT_REFUSED).err == (
         "companion broker init: mosquitto_passwd is not installed: apt install mosquitto\n"
     )
     assert list(tmp_path.iterdir()) == []
 
 
-def test_missing_cryptography_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_cryptography_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import companion.ground.broker
 
     for name in ("setup", "certificates"):
         monkeypatch.delitem(sys.modules, f"companion.ground.broker.{name}")
         monkeypatch.delattr(companion.ground.broker, name)
     monkeypatch.setitem(sys.modules, "cryptography", None)
-    assert main(["broker", "init", str(tmp_path / "site")]) == 3
-    assert capsys.readouterr().err == (
+    assert broker("init", tmp_path / "site", code=EXIT_REFUSED).err == (
         "companion broker init: certificates need cryptography: pip install 'companion-aerial-manipulation[ground]'\n"
     )
 
 
-def test_a_renewed_certificate_is_trusted_with_the_same_ca(
-    site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_renewed_certificate_is_trusted_with_the_same_ca(site: Site, tmp_path: Path) -> None:
     folder = tmp_path / "site"
     shutil.copytree(site.folder, folder)
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-    assert main(["broker", "init", str(folder), "--renew-certificates", "--days", "20"]) == 0
-    assert "gcs.lab" in capsys.readouterr().out
+    assert "gcs.lab" in broker("init", folder, "--renew-certificates", "--days", "20").out
     after = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     assert before.keys() == after.keys()
     assert {path.name for path in before if before[path] != after[path]} == {"server.pem", "server.key"}
@@ -195,25 +183,22 @@ def test_a_renewed_certificate_is_trusted_with_the_same_ca(
     with running(folder, tmp_path) as renewed:
         room = site.folder / "operators/anna"
         words = ["--login", str(room / "login.yaml"), "--ca", str(room / "ca.pem")]
-        assert main(["broker", "check", f"mqtts://127.0.0.1:{renewed.tls_port}", *words]) == 0
-    assert main(["broker", "init", str(folder), "--renew-certificates", "--host", "other.lab"]) == 0
+        broker("check", f"mqtts://127.0.0.1:{renewed.tls_port}", *words)
+    broker("init", folder, "--renew-certificates", "--host", "other.lab")
     assert set(certificate_hosts((folder / "server.pem").read_bytes())) == {"other.lab", *broker_setup.LOCAL_HOSTS}
 
 
-def test_renewal_by_a_wrong_or_old_authority_is_refused(
-    site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_renewal_by_a_wrong_or_old_authority_is_refused(site: Site, tmp_path: Path) -> None:
     folder = tmp_path / "site"
     shutil.copytree(site.folder, folder)
     now = datetime.datetime.now(datetime.UTC)
     (folder / "ca.key").write_bytes(make_authority(now).key)
-    assert main(["broker", "init", str(folder), "--renew-certificates"]) == 2
-    assert "the key does not belong to the certificate" in capsys.readouterr().err
+    ended = broker("init", folder, "--renew-certificates", code=EXIT_BAD_INPUT)
+    assert "the key does not belong to the certificate" in ended.err
     old = make_authority(now - datetime.timedelta(days=3640))
     (folder / "ca.key").write_bytes(old.key)
     (folder / "ca.pem").write_bytes(old.certificate)
-    assert main(["broker", "init", str(folder), "--renew-certificates"]) == 2
-    assert "the authority expires on" in capsys.readouterr().err
+    assert "the authority expires on" in broker("init", folder, "--renew-certificates", code=EXIT_BAD_INPUT).err
     assert (folder / "server.pem").read_bytes() == (site.folder / "server.pem").read_bytes()
     assert make_server(old, ["a"], 5, now).certificate
 
@@ -237,25 +222,23 @@ EXPECTED = {
 
 
 @pytest.mark.parametrize("room", EXPECTED)
-def test_check_finds_what_a_login_may_do(
-    site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str], room: str
-) -> None:
+def test_check_finds_what_a_login_may_do(site: Site, tmp_path: Path, room: str) -> None:
     words, read, write, command, tls = EXPECTED[room]
     words = [*words, "--login", str(site.folder / room / "login.yaml")]
     with running(site.folder, tmp_path) as made:
         if tls:
             words += ["--ca", str(site.folder / room / "ca.pem")]
         url = f"mqtts://localhost:{made.tls_port}" if tls else f"mqtt://127.0.0.1:{made.plain_port}"
-        assert main(["broker", "check", url, *words]) == 0
-    out = capsys.readouterr().out
+        ended = broker("check", url, *words)
+    out = ended.out
     assert ("TLSv1.3" in out) == tls
     assert rights(out) == {**dict.fromkeys(PUBLISHED_TOPICS, (read, write)), "command": command}
 
 
-def test_check_of_the_loopback_profile_may_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with loopback_broker(tmp_path) as broker:
-        assert main(["broker", "check", broker.url]) == 0
-    out = capsys.readouterr().out
+def test_check_of_the_loopback_profile_may_everything(tmp_path: Path) -> None:
+    with loopback_broker(tmp_path) as site:
+        ended = broker("check", site.url)
+    out = ended.out
     assert "connected as anonymous (no login), not encrypted" in out
     assert rights(out) == dict.fromkeys((*PUBLISHED_TOPICS, "command"), ("yes", "yes"))
 
@@ -269,10 +252,9 @@ def test_check_reports_why_it_cannot_connect(
     other.write_bytes(make_authority(datetime.datetime.now(datetime.UTC)).certificate)
 
     def told(*words: str) -> str:
-        code = main(["broker", "check", *words])
-        err = capsys.readouterr().err
-        assert err.count("\n") == 1
-        return f"{code} {err}"
+        ended = run_here("broker", "check", *words)
+        assert len(ended.err_lines) == 1
+        return f"{ended.code} {ended.err}"
 
     with running(site.folder, tmp_path) as made:
         plain, tls = f"mqtt://127.0.0.1:{made.plain_port}", f"mqtts://127.0.0.1:{made.tls_port}"
@@ -300,9 +282,7 @@ def test_check_reports_why_it_cannot_connect(
     ],
     ids=["web server", "silent", "MQTT 3.1.1", "busy"],
 )
-def test_a_server_that_is_no_mqtt_5_broker_is_reported_as_that(
-    capsys: pytest.CaptureFixture[str], answer: bytes, said: str
-) -> None:
+def test_a_server_that_is_no_mqtt_5_broker_is_reported_as_that(answer: bytes, said: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def serve() -> None:
@@ -313,7 +293,7 @@ def test_a_server_that_is_no_mqtt_5_broker_is_reported_as_that(
 
         serving = threading.Thread(target=serve)
         serving.start()
-        assert main(["broker", "check", f"mqtt://127.0.0.1:{server.getsockname()[1]}"]) == EXIT_REFUSED
+        ended = broker("check", f"mqtt://127.0.0.1:{server.getsockname()[1]}", code=EXIT_REFUSED)
         serving.join()
-    text = capsys.readouterr().err
+    text = ended.err
     assert said in text and "--login" not in text

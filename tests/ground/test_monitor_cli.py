@@ -15,7 +15,6 @@ from typing import Any
 import aiohttp
 import pytest
 
-from companion.cli import main as cli
 from companion.config.loader import load_flight
 from companion.ground.protocol.keys import operators_text, write_private
 from companion.ground.protocol.messages import Events, Preflight, Scene, State, Stream, decode
@@ -24,6 +23,7 @@ from companion.model.codec import to_json
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from tests.analysis.synthetic_flight import record_flight
 from tests.broker import Broker, loopback_broker
+from tests.commands import refused
 from tests.ground.monitor_rig import ANNA, OPERATORS, certificate
 from tests.ground.vehicle import played_vehicle
 from tests.support import CATCH, Sandbox, sandbox_in
@@ -41,14 +41,6 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("log") / "flight.mcap"
     record_flight(path, config=load_flight(CATCH).model_dump(mode="json"), end_s=8.0)
     return path
-
-
-def failed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
-    """Return the exit code and the one line."""
-    code = cli.main(["monitor", *arguments])
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1, lines
-    return code, lines[0]
 
 
 async def test_it_prints_an_address_to_open_and_ends_in_order(broker: Broker, sandbox: Sandbox, tmp_path: Path) -> None:
@@ -77,32 +69,29 @@ async def test_it_prints_an_address_to_open_and_ends_in_order(broker: Broker, sa
     sandbox.assert_nobody_left()
 
 
-def test_a_refusal_by_the_broker_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_refusal_by_the_broker_is_one_line(tmp_path: Path) -> None:
     with loopback_broker(tmp_path) as broker:
         broker.stop()
         config = tmp_path / "loopback.conf"
         config.write_text(config.read_text().replace("allow_anonymous true", "allow_anonymous false"))
         broker.start()
         for more in ([], ["--text"]):
-            code, line = failed(["--broker", broker.url, "--view-only", "--port", "0", *more], capsys)
-            assert code == EXIT_REFUSED
+            line = refused(EXIT_REFUSED, "monitor", "--broker", broker.url, "--view-only", "--port", "0", *more)
             assert line == (
                 f"companion monitor: {broker.url}: the broker refuses a connection without login: Not authorized; see --login"
             )
 
 
-def test_an_address_that_cannot_be_listened_on_is_reported_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_address_that_cannot_be_listened_on_is_reported_in_one_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        assert failed(["--port", str(port), "--view-only"], capsys) == (
-            EXIT_REFUSED,
-            f"companion monitor: port {port} of 127.0.0.1 is in use, perhaps by another monitor; choose another: --port N",
-        )
-    code, line = failed(["--host", "192.0.2.7", "--port", "0", "--view-only"], capsys)
-    assert code == EXIT_REFUSED and "--host 192.0.2.7: cannot listen there" in line
+        line = refused(EXIT_REFUSED, "monitor", "--port", port, "--view-only")
+        assert f"port {port} of 127.0.0.1 is in use, perhaps by another monitor; choose another: --port N" in line
+    line = refused(EXIT_REFUSED, "monitor", "--host", "192.0.2.7", "--port", "0", "--view-only")
+    assert "--host 192.0.2.7: cannot listen there" in line
 
 
-def test_bad_input_is_one_line(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(tmp_path: Path, log: Path) -> None:
     damaged, foreign, empty = tmp_path / "damaged.mcap", tmp_path / "foreign.mcap", tmp_path / "empty.mcap"
     data = bytearray(log.read_bytes())
     data[len(data) // 2] ^= 0xFF
@@ -130,8 +119,7 @@ def test_bad_input_is_one_line(tmp_path: Path, log: Path, capsys: pytest.Capture
         (["--operators", "nofile.yaml"], "nofile.yaml: no such file"),
         (["--login", "nofile.yaml"], "nofile.yaml: no such file"),
     ):
-        code, line = failed(arguments, capsys)
-        assert code == EXIT_BAD_INPUT and why in line, (arguments, line)
+        assert why in refused(EXIT_BAD_INPUT, "monitor", *arguments), arguments
 
 
 def test_a_log_is_the_records_that_the_vehicle_would_have_sent(log: Path) -> None:

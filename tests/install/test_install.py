@@ -18,7 +18,8 @@ from companion.install.plan import Command
 from companion.install.record import RECORD_PATH
 from companion.install.state import InstallError, PathState, write_state
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
-from tests.support import ROOT
+from tests.commands import companion, refused
+from tests.support import ROOT, Ended
 
 UNIT = "etc/systemd/system/companion.service"
 RULES = "etc/udev/rules.d/99-companion.rules"
@@ -58,27 +59,24 @@ def tree(root: Path) -> dict[str, tuple[str, int, bytes]]:
     return found
 
 
-def install(root: Path, *more: str) -> int:
-    return main(["install", "--systemd", "--root", str(root), "--mission", MISSION, "--yes", *more])
+def install(root: Path, *more: str, code: int = EXIT_OK) -> Ended:
+    return companion("install", "--systemd", "--root", root, "--mission", MISSION, "--yes", *more, code=code)
 
 
-def undo(root: Path, *more: str) -> int:
-    return main(["install", "--undo", "--root", str(root), "--yes", *more])
+def undo(root: Path, *more: str, code: int = EXIT_OK) -> Ended:
+    return companion("install", "--undo", "--root", root, "--yes", *more, code=code)
 
 
-def test_a_vehicle_file_that_the_service_would_refuse_is_refused_now(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_vehicle_file_that_the_service_would_refuse_is_refused_now(root: Path) -> None:
     shutil.copytree(ROOT / "configs/vehicles", root / "etc/companion/vehicles", dirs_exist_ok=True)
     before = tree(root)
-    assert install(root) == EXIT_BAD_INPUT
-    assert "interface" in capsys.readouterr().err
+    assert "interface" in install(root, code=EXIT_BAD_INPUT).err
     assert tree(root) == before
 
 
 def test_installed_and_undone_leaves_every_byte_as_it_was(root: Path) -> None:
     before = tree(root)
-    assert install(root, "--arm-serial", "FT4THVLI", "--at-boot") == EXIT_OK
+    install(root, "--arm-serial", "FT4THVLI", "--at-boot")
     after = tree(root)
     changed = {path for path in after if after[path] != before.get(path) and after[path][0] != "folder"}
     assert changed == {
@@ -90,47 +88,44 @@ def test_installed_and_undone_leaves_every_byte_as_it_was(root: Path) -> None:
     assert 'ATTRS{serial}=="FT4THVLI", SYMLINK+="companion-arm"' in after[RULES][2].decode()
     assert after[RULES][1] == 0o644
     assert after[RECORD_PATH.lstrip("/")][1] == 0o600
-    assert undo(root) == EXIT_OK
+    undo(root)
     assert tree(root) == before
 
 
-def test_a_second_time_there_is_nothing_to_do(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert install(root) == EXIT_OK
+def test_a_second_time_there_is_nothing_to_do(root: Path) -> None:
+    install(root)
     first = tree(root)
-    capsys.readouterr()
-    assert install(root) == EXIT_OK
-    assert "nothing to do" in capsys.readouterr().out
+    assert "nothing to do" in install(root).out
     assert tree(root) == first
 
 
-def test_a_dry_run_shows_every_byte_and_changes_none(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dry_run_shows_every_byte_and_changes_none(root: Path) -> None:
     before = tree(root)
-    assert install(root, "--dry-run", "--force-serial", "A10M") == EXIT_OK
-    told = capsys.readouterr().out
+    told = install(root, "--dry-run", "--force-serial", "A10M").out
     assert tree(root) == before
-    assert install(root, "--force-serial", "A10M") == EXIT_OK
+    install(root, "--force-serial", "A10M")
     for path in (RULES, UNIT, "etc/security/limits.d/companion.conf"):
         for line in (root / path).read_text().splitlines():
             assert not line or f"    {line}\n" in told
     assert f"replaces  /{RULES}" in told
-    assert undo(root, "--dry-run") == EXIT_OK
+    undo(root, "--dry-run")
     assert (root / UNIT).exists()
 
 
 def test_installed_otherwise_and_undone_is_as_before_the_first_time(root: Path) -> None:
     before = tree(root)
-    assert install(root, "--at-boot", "--user", "pilot") == EXIT_OK
+    install(root, "--at-boot", "--user", "pilot")
     assert "User=pilot" in (root / UNIT).read_text()
-    assert install(root, "--arm-serial", "FT1") == EXIT_OK
+    install(root, "--arm-serial", "FT1")
     wants = root / "etc/systemd/system/multi-user.target.wants"
     assert [path.name for path in wants.iterdir()] == ["companion-performance.service"]
     assert "User=companion" in (root / UNIT).read_text()
-    assert undo(root) == EXIT_OK
+    undo(root)
     assert tree(root) == before
 
 
 @pytest.mark.parametrize("obstacle", ["etc/security", "etc/systemd", "var", "var/lib/companion/installed.json"])
-def test_what_fails_half_way_is_put_back(root: Path, obstacle: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_fails_half_way_is_put_back(root: Path, obstacle: str) -> None:
     """A file where a folder is needed, or the reverse, at the start, in the middle and at the end."""
     path = root / obstacle
     if obstacle.endswith(".json"):
@@ -139,9 +134,9 @@ def test_what_fails_half_way_is_put_back(root: Path, obstacle: str, capsys: pyte
         shutil.rmtree(path, ignore_errors=True)
         path.write_text("in the way\n")
     before = tree(root)
-    assert install(root) == EXIT_REFUSED
+    ended = install(root, code=EXIT_REFUSED)
     assert tree(root) == before
-    [line] = capsys.readouterr().err.splitlines()
+    [line] = ended.err_lines
     assert path.name in line
 
 
@@ -171,7 +166,7 @@ def test_a_failure_half_way_leaves_everything_as_it_was(
 ) -> None:
     before = tree(root)
     fail_at_the_third_file(monkeypatch, failure)
-    assert install(root) == code
+    install(root, code=code)
     assert tree(root) == before
 
 
@@ -179,13 +174,13 @@ def test_a_change_that_fails_half_way_leaves_the_first_installation(
     root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = tree(root)
-    assert install(root) == EXIT_OK
+    install(root)
     first = tree(root)
     with monkeypatch.context() as patch:
         fail_at_the_third_file(patch, OSError(errno.EIO, os.strerror(errno.EIO), "/etc/x"))
-        assert install(root, "--user", "pilot", "--arm-serial", "FT1", "--at-boot") == EXIT_REFUSED
+        install(root, "--user", "pilot", "--arm-serial", "FT1", "--at-boot", code=EXIT_REFUSED)
     assert tree(root) == first
-    assert undo(root) == EXIT_OK
+    undo(root)
     assert tree(root) == before
 
 
@@ -195,49 +190,44 @@ def test_what_was_cut_off_half_way_is_undone(root: Path, monkeypatch: pytest.Mon
     with pytest.raises(PowerLossError):
         install(root)
     assert tree(root) != before
-    assert undo(root) == EXIT_OK
+    undo(root)
     assert tree(root) == before
 
 
-def test_a_file_that_somebody_changed_is_not_overwritten(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert install(root) == EXIT_OK
+def test_a_file_that_somebody_changed_is_not_overwritten(root: Path) -> None:
+    install(root)
     (root / UNIT).write_text((root / UNIT).read_text() + "Nice=0\n")
     changed = tree(root)
-    capsys.readouterr()
-    for attempt in (undo(root), install(root, "--arm-serial", "FT1")):
-        assert attempt == EXIT_REFUSED
+    for more in (("--undo",), ("--systemd", "--mission", MISSION, "--arm-serial", "FT1")):
+        line = refused(EXIT_REFUSED, "install", *more, "--root", root, "--yes")
+        assert f"/{UNIT}: was modified after" in line
         assert tree(root) == changed
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 2
-    assert all(f"/{UNIT}: was modified after" in line for line in lines)
 
 
-def test_a_folder_that_others_use_by_now_is_kept(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert install(root) == EXIT_OK
+def test_a_folder_that_others_use_by_now_is_kept(root: Path) -> None:
+    install(root)
     (root / "var/lib/companion/fly").mkdir()
-    assert undo(root) == EXIT_OK
+    ended = undo(root)
     assert (root / "var/lib/companion/fly").is_dir()
     assert not (root / RECORD_PATH.lstrip("/")).exists()
-    assert "kept /var/lib/companion" in capsys.readouterr().out
+    assert "kept /var/lib/companion" in ended.out
 
 
-def test_a_record_that_others_could_write_is_not_trusted(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert install(root) == EXIT_OK
+def test_a_record_that_others_could_write_is_not_trusted(root: Path) -> None:
+    install(root)
     (root / RECORD_PATH.lstrip("/")).chmod(0o666)
-    assert undo(root) == EXIT_REFUSED
-    assert "not trusted" in capsys.readouterr().err
+    assert "not trusted" in undo(root, code=EXIT_REFUSED).err
     (root / RECORD_PATH.lstrip("/")).chmod(0o600)
     (root / RECORD_PATH.lstrip("/")).write_text("{}")
-    assert undo(root) == EXIT_REFUSED
-    assert "not a valid record" in capsys.readouterr().err
+    assert "not a valid record" in undo(root, code=EXIT_REFUSED).err
 
 
 @pytest.mark.parametrize("goes", [True, False], ids=["the user is deleted", "the user stays"])
 def test_keys_go_with_the_user_who_is_deleted_and_stay_with_one_who_stays(
-    root: Path, tmp_path: Path, goes: bool, capsys: pytest.CaptureFixture[str]
+    root: Path, tmp_path: Path, goes: bool
 ) -> None:
     """A free user id is assigned to the next user, who must not find operator keys."""
-    assert install(root) == EXIT_OK
+    install(root)
     path = root / RECORD_PATH.lstrip("/")
     record = json.loads(path.read_text())
     record["users"] = [pwd.getpwuid(os.geteuid()).pw_name] if goes else []
@@ -249,10 +239,10 @@ def test_keys_go_with_the_user_who_is_deleted_and_stay_with_one_who_stays(
         file.write_text("key")
     (home / ".config/elsewhere").symlink_to(others)
     (home / "flights/elsewhere").symlink_to(others)
-    assert undo(root) == EXIT_OK
+    ended = undo(root)
     assert keys.exists() is not goes
     assert log.exists() and (others / "secret").exists()
-    assert ("the service's keys" in capsys.readouterr().out) is goes
+    assert ("the service's keys" in ended.out) is goes
 
 
 def test_without_a_yes_nothing_is_done(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -272,18 +262,14 @@ def test_without_a_yes_nothing_is_done(root: Path, monkeypatch: pytest.MonkeyPat
     assert tree(root) != before
 
 
-def test_json_is_all_that_is_printed(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert install(root, "--json", "--dry-run") == EXIT_OK
-    told = json.loads(capsys.readouterr().out)
+def test_json_is_all_that_is_printed(root: Path) -> None:
+    told = json.loads(install(root, "--json", "--dry-run").out)
     assert not told["done"]
     assert told["commands"] == []  # of a root that is not this computer's
     assert [file["path"] for file in told["files"] if file["replaces"]] == [f"/{RULES}"]
-    assert install(root, "--json") == EXIT_OK
-    assert json.loads(capsys.readouterr().out)["done"]
-    assert install(root, "--json") == EXIT_OK
-    assert not json.loads(capsys.readouterr().out)["done"]
-    assert undo(root, "--json") == EXIT_OK
-    assert f"/{UNIT}" in json.loads(capsys.readouterr().out)["files"]
+    assert json.loads(install(root, "--json").out)["done"]
+    assert not json.loads(install(root, "--json").out)["done"]
+    assert f"/{UNIT}" in json.loads(undo(root, "--json").out)["files"]
 
 
 @pytest.mark.parametrize(
@@ -298,28 +284,23 @@ def test_json_is_all_that_is_printed(root: Path, capsys: pytest.CaptureFixture[s
         (("--root", "/nowhere/at/all"), "expected the root folder"),
     ],
 )
-def test_wrong_input_is_refused(
-    root: Path, arguments: tuple[str, ...], why: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_input_is_refused(root: Path, arguments: tuple[str, ...], why: str) -> None:
     before = tree(root)
-    assert install(root, *arguments) == EXIT_BAD_INPUT
-    assert why in capsys.readouterr().err
+    assert why in install(root, *arguments, code=EXIT_BAD_INPUT).err
     assert tree(root) == before
 
 
-def test_a_vehicle_that_nobody_could_command_is_refused(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_vehicle_that_nobody_could_command_is_refused(root: Path) -> None:
     vehicle = root / "etc/companion/vehicles/tarot650_2r.yaml"
     text = vehicle.read_text()
     head, _, _ = text.partition("\nground:")
     vehicle.write_text(head + "\nground:\n  mqtt: null\n")
-    assert install(root) == EXIT_BAD_INPUT
-    assert "commands are not possible" in capsys.readouterr().err
+    assert "commands are not possible" in install(root, code=EXIT_BAD_INPUT).err
 
 
-def test_a_mission_that_the_service_could_not_read_is_refused(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mission_that_the_service_could_not_read_is_refused(root: Path) -> None:
     (root / "etc/companion/missions").chmod(0o700)
-    assert install(root) == EXIT_BAD_INPUT
-    assert "chmod o+rX" in capsys.readouterr().err
+    assert "chmod o+rX" in install(root, code=EXIT_BAD_INPUT).err
 
 
 def test_commands_run_with_a_fixed_path(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,46 +5,37 @@ from __future__ import annotations
 import asyncio
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.cli.main import main
 from companion.io.px4.transfer import compare
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from companion.px4 import params_file
 from companion.px4.params_file import single
 from companion.px4.required import file_values
+from tests.commands import companion
 from tests.io.px4_peer import Px4Peer
 from tests.io.stub_rig import standing_stub
-from tests.support import free_udp_port
+from tests.support import Ended, free_udp_port
 
 SPOILED = {"EKF2_EV_CTRL": 3, "COM_OF_LOSS_T": 5.0, "EKF2_HGT_REF": 0}
 
 
-def params(port: int, *words: str) -> int:
-    return main(["px4", "params", "--address", f"udpin://127.0.0.1:{port}", *words])
+def params(port: int, *words: object, code: int = EXIT_OK) -> Ended:
+    return companion("px4", "params", "--address", f"udpin://127.0.0.1:{port}", *words, code=code)
 
 
-def told(capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    loaded: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return loaded
-
-
-async def test_diff_write_diff_on_the_stub(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_diff_write_diff_on_the_stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.io.px4.params.ASKS", 1)  # every read asks for the ports that the stub does not have
     backup = tmp_path / "old.params"
 
-    async def run(*words: str) -> int:
-        return await asyncio.to_thread(params, port, *words)
+    async def run(*words: object, code: int = EXIT_OK) -> Ended:
+        return await asyncio.to_thread(params, port, *words, code=code)
 
     port = free_udp_port()
     async with standing_stub(port, SPOILED) as stub:
-        assert await run("--diff", "--json") == EXIT_REFUSED
-        found = told(capsys)
+        found = json.loads((await run("--diff", "--json", code=EXIT_REFUSED)).out)
         assert found["ok"] is False
         assert {row["name"]: (row["px4"], row["reboot"]) for row in found["differs"]} == {
             "EKF2_EV_CTRL": (3, False),
@@ -55,18 +46,15 @@ async def test_diff_write_diff_on_the_stub(
         assert "written" not in found
 
         revision = stub.params.revision
-        assert await run("--write", "--json", "--backup", str(backup)) == EXIT_OK
-        found = told(capsys)
+        found = json.loads((await run("--write", "--json", "--backup", backup)).out)
         assert set(found["written"]) == set(SPOILED)
         assert found["reboot"] == ["EKF2_HGT_REF"]
         assert stub.params.revision == revision + len(SPOILED), "only what differed was written"
         assert all(stub.params[name] == single(file_values()[name]) for name in SPOILED)
         assert params_file.read(backup).values == {1: SPOILED}
 
-        assert await run("--diff") == EXIT_OK
-        assert "nothing differs" in capsys.readouterr().out
-        assert await run("--write", str(backup), "--backup", str(tmp_path / "older.params")) == EXIT_OK
-        assert "reboot PX4: EKF2_HGT_REF" in capsys.readouterr().out
+        assert "nothing differs" in (await run("--diff")).out
+        assert "reboot PX4: EKF2_HGT_REF" in (await run("--write", backup, "--backup", tmp_path / "older.params")).out
         assert all(stub.params[name] == value for name, value in SPOILED.items())
 
 
@@ -77,37 +65,36 @@ def mine(tmp_path: Path) -> Path:
     return path
 
 
-def test_writing_is_refused_while_armed(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_writing_is_refused_while_armed(mine: Path) -> None:
     port = free_udp_port()
     with Px4Peer(port) as peer:
         peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
-        assert params(port, "--write", str(mine), "--backup", str(mine.with_name("old"))) == EXIT_REFUSED
-        assert "expected a disarmed PX4, but it is armed" in capsys.readouterr().err
+        ended = params(port, "--write", mine, "--backup", mine.with_name("old"), code=EXIT_REFUSED)
+        assert "expected a disarmed PX4, but it is armed" in ended.err
         assert peer.of("PARAM_SET") == []
-        assert params(port, "--diff", str(mine)) == EXIT_REFUSED
-        assert "2 differ" in capsys.readouterr().out
+        assert "2 differ" in params(port, "--diff", mine, code=EXIT_REFUSED).out
     assert not mine.with_name("old").exists()
 
 
-def test_old_values_are_kept_before_anything_is_written(mine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_old_values_are_kept_before_anything_is_written(mine: Path) -> None:
     port = free_udp_port()
     with Px4Peer(port) as peer:
-        assert params(port, "--write", str(mine), "--backup", str(mine)) == EXIT_BAD_INPUT
-        assert "already exists; choose another name (nothing was written)" in capsys.readouterr().err
+        ended = params(port, "--write", mine, "--backup", mine, code=EXIT_BAD_INPUT)
+        assert "already exists; choose another name (nothing was written)" in ended.err
         assert peer.of("PARAM_SET") == []
 
 
-def test_a_name_that_px4_does_not_have_is_not_all_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_name_that_px4_does_not_have_is_not_all_written(tmp_path: Path) -> None:
     path = tmp_path / "mine.params"
     path.write_text(params_file.text({"NO_SUCH_ONE": 1, "COM_RC_IN_MODE": 3}), encoding="utf-8")
     port = free_udp_port()
     with Px4Peer(port) as peer:
-        assert params(port, "--write", str(path), "--backup", str(tmp_path / "old.params")) == EXIT_REFUSED
-        assert "NO_SUCH_ONE       PX4 does not have this parameter" in capsys.readouterr().out
+        ended = params(port, "--write", path, "--backup", tmp_path / "old.params", code=EXIT_REFUSED)
+        assert "NO_SUCH_ONE       PX4 does not have this parameter" in ended.out
         assert peer.params["COM_RC_IN_MODE"] == 3
 
 
-def test_only_the_rows_of_this_px4_are_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_the_rows_of_this_px4_are_written(tmp_path: Path) -> None:
     path, backup = tmp_path / "mine.params", tmp_path / "old.params"
     path.write_text(
         "7\t1\tCOM_RC_IN_MODE\t3\t6\n7\t124\tSDLOG_MODE\t3\t6\n1\t1\tMPC_THR_HOVER\t0.9\t9\n", encoding="utf-8"
@@ -115,28 +102,24 @@ def test_only_the_rows_of_this_px4_are_written(tmp_path: Path, capsys: pytest.Ca
     port = free_udp_port()
     with Px4Peer(port) as peer:
         peer.params["MAV_SYS_ID"] = 7
-        assert params(port, "--write", str(path), "--backup", str(backup)) == EXIT_OK
-        said = capsys.readouterr().out
+        said = params(port, "--write", path, "--backup", backup).out
         assert [message.param_id for message in peer.of("PARAM_SET")] == ["COM_RC_IN_MODE"]
         assert "skipped, because it is not this vehicle's PX4: vehicle 1, component 1: MPC_THR_HOVER" in said
         assert "skipped, because it is not this vehicle's PX4: vehicle 7, component 124: SDLOG_MODE" in said
         assert params_file.read(backup).values == {7: {"COM_RC_IN_MODE": 4}}, "the backup can be restored"
 
         peer.params["MAV_SYS_ID"] = 8
-        assert params(port, "--write", str(path), "--backup", str(tmp_path / "older")) == EXIT_BAD_INPUT
-        assert (
-            "expected parameters of vehicle 8 (MAV_SYS_ID of this PX4), found those of vehicle 7, 1"
-            in capsys.readouterr().err
-        )
+        ended = params(port, "--write", path, "--backup", tmp_path / "older", code=EXIT_BAD_INPUT)
+        assert "expected parameters of vehicle 8 (MAV_SYS_ID of this PX4), found those of vehicle 7, 1" in ended.err
 
 
-def test_another_type_than_px4s_is_reported_and_not_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_type_than_px4s_is_reported_and_not_written(tmp_path: Path) -> None:
     path = tmp_path / "mine.params"
     path.write_text(params_file.text({"MPC_THR_HOVER": 1}), encoding="utf-8")
     port = free_udp_port()
     with Px4Peer(port) as peer:
-        assert params(port, "--write", str(path), "--backup", str(tmp_path / "old.params")) == EXIT_REFUSED
-        assert "MPC_THR_HOVER: PX4 has a REAL32, but the file has an INT32; correct the file" in capsys.readouterr().out
+        ended = params(port, "--write", path, "--backup", tmp_path / "old.params", code=EXIT_REFUSED)
+        assert "MPC_THR_HOVER: PX4 has a REAL32, but the file has an INT32; correct the file" in ended.out
         assert peer.of("PARAM_SET") == []
 
 
