@@ -12,21 +12,18 @@ import serial
 from companion.config.arm import Arm as ArmConfig
 from companion.config.arm import Joint
 from companion.io.dynamixel.arm import DynamixelArm
-from companion.io.protocols import DeviceError
 from companion.runtime.clock import flight_clock
 from sitl.servo import registers as reg
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from tests.io.arm_rig import arm_config, device_on, flying_arm, new_servos, register, state_when
+from tests.io.refusal import refusal
 
 
 async def opening(path: str, config: ArmConfig | None = None) -> str:
     """Text with which the edge refuses a port."""
-    arm = DynamixelArm(device_on(path), config or arm_config(), flight_clock())
-    with pytest.raises(DeviceError) as caught:
-        await arm.__aenter__()
-    text = str(caught.value)
-    assert "\n" not in text and text.startswith(f"arm bus {path}: ")
+    text = await refusal(DynamixelArm(device_on(path), config or arm_config(), flight_clock()))
+    assert text.startswith(f"arm bus {path}: ")
     return text
 
 

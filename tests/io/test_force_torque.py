@@ -20,6 +20,7 @@ from companion.io.protocols import DeviceError, ForceTorque
 from companion.model.types import ForceSample
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
+from tests.io.refusal import refusal
 from tests.support import DEADLINE_S
 from tests.wires import plugged, serial_line
 
@@ -251,15 +252,6 @@ async def looked_at(edge: RobotousForceTorque, condition: Callable[[ForceSample]
 
 
 # -- what can be wrong ---------------------------------------------------------------------------------------------------------
-
-
-async def refusal(edge: RobotousForceTorque) -> str:
-    with pytest.raises(DeviceError) as caught:
-        async with edge:
-            pass
-    text = str(caught.value)
-    assert "\n" not in text
-    return text
 
 
 def test_no_such_port() -> None:

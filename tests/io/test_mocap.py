@@ -20,11 +20,12 @@ from companion.config.devices import MocapDevice
 from companion.io.mocap import natnet
 from companion.io.mocap.driver import MocapDriver
 from companion.io.mocap.natnet import Message
-from companion.io.protocols import DeviceError, Mocap
+from companion.io.protocols import Mocap
 from companion.model.types import MocapPose, Vec3
 from companion.runtime.clock import flight_clock
 from sitl.natnet import BodyPose, NatNetServer
 from tests.io.natnet_bytes import LATER, VERSIONS
+from tests.io.refusal import refusal
 from tests.support import DEADLINE_S
 
 GROUP = "239.255.42.99"
@@ -246,15 +247,6 @@ def test_callback_that_fails_does_not_stop_reception(caplog: pytest.LogCaptureFi
 
 
 # -- what can be wrong ---------------------------------------------------------------------------------------------------------
-
-
-async def refusal(edge: MocapDriver) -> str:
-    with pytest.raises(DeviceError) as caught:
-        async with edge:
-            pass
-    text = str(caught.value)
-    assert "\n" not in text
-    return text
 
 
 async def test_no_answer() -> None:

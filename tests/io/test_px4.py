@@ -12,7 +12,6 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.config.devices import AutopilotDevice
-from companion.io.protocols import DeviceError
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.flight_stage import is_killed
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
@@ -26,17 +25,32 @@ from companion.model.types import (
     Quat,
     Vec3,
 )
-from companion.runtime.clock import flight_clock
+from companion.runtime.clock import Clock, flight_clock
 from tests.io.px4_peer import ACCEL_FRD_M_S2, GYRO_FRD_RAD_S, POSITION_NED_M, VELOCITY_NED_M_S, Px4Peer
+from tests.io.refusal import refusal
 from tests.support import DEADLINE_S, eventually, free_udp_port
 
 LEAN_RAD = 0.2
 DO_SET_MODE, NAV_LAND, ARM_DISARM = 176, 21, 400
 
 
-def edge(port: int, discovery_timeout_s: float = DEADLINE_S) -> MavsdkAutopilot:
-    device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=discovery_timeout_s)
-    return MavsdkAutopilot(device, flight_clock())
+def edge(where: int | str, clock: Clock | None = None, *, forwarding: bool = False, **device: Any) -> MavsdkAutopilot:
+    """The companion's end of a link: an address, or a port of this computer."""
+    address = where if isinstance(where, str) else f"udpin://127.0.0.1:{where}"
+    settings = AutopilotDevice(address=address, **{"discovery_timeout_s": DEADLINE_S, **device})
+    return MavsdkAutopilot(settings, clock or flight_clock(), forwarding=forwarding)
+
+
+def pose_of(number: int, attitude_wxyz: Quat = (1.0, 0.0, 0.0, 0.0), stamp_s: float = 12.5) -> MocapPose:
+    return MocapPose(
+        stamp_s=stamp_s,
+        latency_s=0.003,
+        frame_number=number,
+        position_world_m=(1.5, -0.25, 0.75),
+        attitude_wxyz=attitude_wxyz,
+        tracking_valid=True,
+        marker_error_m=0.0,
+    )
 
 
 @contextlib.asynccontextmanager
@@ -60,13 +74,7 @@ def armed(autopilot: MavsdkAutopilot) -> bool:
 
 
 async def refused(address: str, discovery_timeout_s: float = 20.0) -> str:
-    autopilot = MavsdkAutopilot(
-        AutopilotDevice(address=address, discovery_timeout_s=discovery_timeout_s), flight_clock()
-    )
-    with pytest.raises(DeviceError) as caught:
-        await autopilot.__aenter__()
-    text = str(caught.value)
-    assert "\n" not in text
+    text = await refusal(edge(address, discovery_timeout_s=discovery_timeout_s))
     assert text.startswith(f"autopilot {address}: expected ")
     return text
 
@@ -101,16 +109,7 @@ async def test_attitudes_of_setpoints_and_mocap_arrive_in_ned() -> None:
             # Independent of Euler conventions: the thrust points to the same side on both ends of the wire.
             north, east, down = quat_rotate(tuple(target.q), (0.0, 0.0, -1.0))
             assert (east, north, -down) == pytest.approx(quat_rotate(attitude, (0.0, 0.0, 1.0)), abs=1e-6)
-            pose = MocapPose(
-                stamp_s=12.5,
-                latency_s=0.003,
-                frame_number=number,
-                position_world_m=(1.5, -0.25, 0.75),
-                attitude_wxyz=attitude,
-                tracking_valid=True,
-                marker_error_m=0.0,
-            )
-            assert autopilot.send_vision(pose)
+            assert autopilot.send_vision(pose_of(number, attitude))
             estimate = await asyncio.to_thread(peer.wait_for, "VISION_POSITION_ESTIMATE", number)
             assert (estimate.x, estimate.y, estimate.z) == (-0.25, 1.5, -0.75)
             angles = (estimate.roll, estimate.pitch, estimate.yaw)
@@ -231,9 +230,8 @@ async def test_the_heartbeat_of_an_armed_px4_is_requested_so_that_a_kill_is_seen
 async def test_heartbeat_loss_shows_as_an_old_stamp() -> None:
     port = free_udp_port()
     clock = flight_clock()
-    device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
     with Px4Peer(port) as peer:
-        async with MavsdkAutopilot(device, clock) as autopilot:
+        async with edge(port, clock) as autopilot:
             await eventually(lambda: autopilot.status() is not None, "a heartbeat")
 
             def age_s() -> float:

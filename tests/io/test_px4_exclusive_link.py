@@ -15,20 +15,15 @@ import pytest
 import serial
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4 import frames as px4_frames
-from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.px4.exclusive_link import ExclusiveLink
 from companion.io.px4.frames import AutopilotHeartbeat
-from companion.model.types import MocapPose
-from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
-from tests.io.test_px4 import armed, edge, refused
+from tests.io.test_px4 import armed, edge, pose_of, refused
 from tests.support import DEADLINE_S, eventually, free_udp_port
 from tests.wires import serial_line
 
-LEVEL = (1.0, 0.0, 0.0, 0.0)
 ARMED = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 
@@ -53,8 +48,7 @@ def test_a_serial_port_that_another_program_has_locked_is_refused_by_every_name(
 def test_a_second_flight_on_the_same_serial_port_is_refused_and_the_first_keeps_it() -> None:
     async def main(port: str) -> str:
         address = f"serial://{port}:921600"
-        first = MavsdkAutopilot(AutopilotDevice(address=address, discovery_timeout_s=60.0), flight_clock())
-        entering = asyncio.create_task(first.__aenter__())
+        entering = asyncio.create_task(edge(address).__aenter__())
         await eventually(lambda: _is_held(port), "the first has the port")
         text = await refused(address, 0.2)
         assert not entering.done()
@@ -130,9 +124,8 @@ class _Broadcasting(Px4Peer):
 
 async def test_px4_that_broadcasts_until_it_has_a_partner_is_found() -> None:
     port = free_udp_port()
-    device = AutopilotDevice(address=f"udpin://0.0.0.0:{port}", discovery_timeout_s=DEADLINE_S)
     with _Broadcasting(port) as px4:
-        async with MavsdkAutopilot(device, flight_clock()) as autopilot:
+        async with edge(f"udpin://0.0.0.0:{port}") as autopilot:
             assert autopilot.identity().peer == px4.address
             await eventually(lambda: autopilot.status() is not None, "a heartbeat")
 
@@ -258,16 +251,7 @@ async def test_px4_that_restarts_at_the_same_address_is_heard_again() -> None:
         async with edge(port) as autopilot:
             px4.__exit__(None, None, None)
             for tick in range(20):  # what is sent now comes back as ICMP errors
-                autopilot.send_vision(
-                    MocapPose(
-                        stamp_s=1.0 + tick,
-                        frame_number=tick,
-                        position_world_m=(0.0, 0.0, 0.0),
-                        attitude_wxyz=LEVEL,
-                        tracking_valid=True,
-                        marker_error_m=0.0,
-                    )
-                )
+                autopilot.send_vision(pose_of(tick, stamp_s=1.0 + tick))
                 await asyncio.sleep(0.005)
             with Px4Peer(port, at=where) as again:
                 again.base_mode = ARMED

@@ -12,16 +12,13 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.config.devices import AutopilotDevice
 from companion.io.protocols import DeviceError
 from companion.io.px4 import params as autopilot_params
-from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.estimator import EstimatorReport
 from companion.model.types import AttitudeSetpoint, AutopilotRequest
-from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import PARAMS, Px4Peer
 from tests.io.test_px4 import ARM_DISARM, armed, edge, linked, refused
-from tests.support import DEADLINE_S, eventually, free_udp_port
+from tests.support import eventually, free_udp_port
 from tests.wires import serial_line
 
 
@@ -91,9 +88,8 @@ async def test_streams_without_a_reader_are_stopped(forwarding: bool, armed: boo
     port = free_udp_port()
     with Px4Peer(port) as peer:
         peer.base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
         unread = (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ODOMETRY)
-        async with MavsdkAutopilot(device, flight_clock(), forwarding=forwarding):
+        async with edge(port, forwarding=forwarding):
             if not armed:
                 await eventually(lambda: all(stream in peer.asked_interval_us for stream in unread), "streams stopped")
         peer.packets_so_far()

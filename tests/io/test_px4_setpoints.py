@@ -12,32 +12,24 @@ import pytest
 from mavsdk.plugins.offboard.offboard import Attitude
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.config.devices import AutopilotDevice
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.io.px4.setpoints import DirectSetpoints, OffboardSetpoints
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import AttitudeSetpoint, FlightMode
-from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import Px4Peer
-from tests.io.test_px4 import DO_SET_MODE, GOLDEN_ATTITUDES, WRONG_SETPOINTS, assert_attitude_target
-from tests.support import DEADLINE_S, eventually, free_udp_port
+from tests.io.test_px4 import DO_SET_MODE, GOLDEN_ATTITUDES, WRONG_SETPOINTS, assert_attitude_target, edge
+from tests.support import eventually, free_udp_port
 
 Way = Literal["direct", "offboard"]
 WAYS: tuple[Way, ...] = get_args(Way)
 LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.5)
 
 
-def edge(port: int, way: Way) -> MavsdkAutopilot:
-    address = f"udpin://127.0.0.1:{port}"
-    device = AutopilotDevice(address=address, discovery_timeout_s=DEADLINE_S, setpoint_path=way)
-    return MavsdkAutopilot(device, flight_clock())
-
-
 async def test_the_plugin_sends_the_same_attitude_and_thrust_and_nothing_that_must_not_leave() -> None:
     """MAVSDK itself would send it."""
     port = free_udp_port()
     with Px4Peer(port) as peer:
-        async with edge(port, "offboard") as autopilot:
+        async with edge(port, setpoint_path="offboard") as autopilot:
             for number, (euler_world_rad, euler_ned_rad) in enumerate(GOLDEN_ATTITUDES, 1):
                 assert autopilot.send_attitude(AttitudeSetpoint(quat_from_euler_zyx(*euler_world_rad), 0.625))
                 target = await asyncio.to_thread(peer.wait_for, "SET_ATTITUDE_TARGET", number)
@@ -73,7 +65,7 @@ async def test_each_setpoint_leaves_once_and_a_caller_who_falls_silent_leaves_no
 
     port = free_udp_port()
     with Px4Peer(port) as peer:
-        async with edge(port, way) as autopilot:
+        async with edge(port, setpoint_path=way) as autopilot:
             await fly_in_offboard(peer, autopilot)
             assert await counted(peer, 0.5) == 0
             for k in range(10):
@@ -92,7 +84,7 @@ async def test_what_the_plugin_does_not_send_in_time_leaves_straight_and_once(mo
 
     port = free_udp_port()
     with Px4Peer(port) as peer:
-        async with edge(port, "offboard") as autopilot:
+        async with edge(port, setpoint_path="offboard") as autopilot:
             await fly_in_offboard(peer, autopilot)
             for _ in range(20):
                 assert autopilot.send_attitude(LEVEL)

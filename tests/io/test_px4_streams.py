@@ -12,12 +12,11 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.config.devices import AutopilotDevice
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.types import AttitudeSetpoint, AutopilotRequest
-from companion.runtime.clock import flight_clock
 from tests.io.px4_peer import PARAMS, Px4Peer
-from tests.support import DEADLINE_S, eventually
+from tests.io.test_px4 import edge
+from tests.support import eventually
 from tests.wires import bridged, plugged, serial_line
 
 LEVEL = AttitudeSetpoint((1.0, 0.0, 0.0, 0.0), 0.5)
@@ -51,8 +50,7 @@ def tcp_link() -> Iterator[str]:
 @pytest.mark.parametrize("link", [serial_link, tcp_link])
 def test_px4_behind_a_stream_of_bytes(link: Callable[[], AbstractContextManager[str]]) -> None:
     async def fly(address: str) -> None:
-        device = AutopilotDevice(address=address, discovery_timeout_s=DEADLINE_S)
-        async with MavsdkAutopilot(device, flight_clock()) as autopilot:
+        async with edge(address) as autopilot:
             await eventually(lambda: autopilot.vehicle() is not None, "the vehicle's state")
             assert await autopilot.read_param("MPC_THR_HOVER") == PARAMS["MPC_THR_HOVER"]
             assert autopilot.send_attitude(LEVEL)
@@ -66,10 +64,9 @@ def test_px4_behind_a_stream_of_bytes(link: Callable[[], AbstractContextManager[
 async def test_a_serial_port_that_comes_back_under_its_name_is_used_again_and_the_streams_are_requested_again(
     tmp_path: Path,
 ) -> None:
-    device = AutopilotDevice(address=f"serial://{tmp_path / 'px4'}:921600", discovery_timeout_s=DEADLINE_S)
     async with contextlib.AsyncExitStack() as stack:
         with px4_cable(tmp_path / "px4"):
-            autopilot = await stack.enter_async_context(MavsdkAutopilot(device, flight_clock()))
+            autopilot = await stack.enter_async_context(edge(f"serial://{tmp_path / 'px4'}:921600"))
             await eventually(lambda: autopilot.vehicle() is not None, "the vehicle's state")
         await eventually(lambda: has_hung_up(autopilot), "the loss")
         before = autopilot.counts()

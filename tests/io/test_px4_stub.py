@@ -8,7 +8,6 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from companion.config.devices import AutopilotDevice
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.frames import quat_from_euler_zyx
 from companion.model.types import (
@@ -19,7 +18,8 @@ from companion.model.types import (
 )
 from companion.runtime.clock import Clock, flight_clock
 from tests.io.stub_rig import standing_stub
-from tests.support import DEADLINE_S, eventually, free_udp_port
+from tests.io.test_px4 import edge
+from tests.support import eventually, free_udp_port
 
 AIDED = 16 | 32 | 256
 """ESTIMATOR_POS_HORIZ_ABS, POS_VERT_ABS, PRED_POS_HORIZ_REL"""
@@ -70,8 +70,7 @@ class Companion:
 @asynccontextmanager
 async def companion(port: int) -> AsyncIterator[Companion]:
     clock = flight_clock()
-    device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
-    async with MavsdkAutopilot(device, clock) as autopilot, asyncio.TaskGroup() as group:
+    async with edge(port, clock) as autopilot, asyncio.TaskGroup() as group:
         half = Companion(autopilot, clock)
         running = group.create_task(half.run())
         try:
@@ -82,8 +81,7 @@ async def companion(port: int) -> AsyncIterator[Companion]:
 
 async def test_the_stub_without_a_setpoint_stream_or_mocap() -> None:
     port = free_udp_port()
-    device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=DEADLINE_S)
-    async with standing_stub(port) as stub, MavsdkAutopilot(device, flight_clock()) as autopilot:
+    async with standing_stub(port) as stub, edge(port) as autopilot:
         assert stub.origin is not None
         assert not await autopilot.ensure_origin()  # PX4 tells only with a valid position
         await eventually(lambda: autopilot.estimator() is not None, "ESTIMATOR_STATUS")

@@ -7,12 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from companion.config.devices import AutopilotDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.flight.startup import changed_since
-from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.check_row import Level, Row
 from companion.preflight.evaluation import param_names
 from companion.preflight.px4 import firmware_row, rows
@@ -20,12 +18,12 @@ from companion.px4.defaults import PX4_DEFAULTS
 from companion.px4.required import HOVER, ROTOR_COUNT, WANTED, file_values, simulated_values
 from companion.px4.rotors import geometry_of
 from companion.px4.versions import has
-from companion.runtime.clock import flight_clock
 from companion.sitl_config.loader import load_world
 from companion.sitl_config.world import World
 from sitl.autopilot.backend import stub_of
 from sitl.px4.parameters import parameters
 from tests.io.stub_rig import standing_stub
+from tests.io.test_px4 import edge
 from tests.support import free_udp_port
 
 VEHICLE_FILE = Path(__file__).parents[2] / "configs/vehicles/tarot650_2r.yaml"
@@ -165,9 +163,8 @@ def test_parameters_that_nobody_could_read_keep_the_machine_down() -> None:
 def test_a_parameter_that_changes_while_the_flight_waits_refuses_the_start_until_it_is_set_back() -> None:
     async def answers() -> list[str]:
         port = free_udp_port()
-        device = AutopilotDevice(address=f"udpin://127.0.0.1:{port}", discovery_timeout_s=20.0)
         said = []
-        async with standing_stub(port), MavsdkAutopilot(device, flight_clock()) as autopilot:
+        async with standing_stub(port), edge(port) as autopilot:
             checked = await autopilot.read_params(param_names(vehicle()))
             before = checked["COM_OBL_RC_ACT"]
             for value in (before, 6, before):
