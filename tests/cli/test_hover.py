@@ -12,13 +12,14 @@ import pytest
 
 from companion.analysis.hover_fit import HoverFit, VoltageSlope
 from companion.analysis.log import FlightLog
-from companion.cli import main as cli
 from companion.cli.hover import jsonable, lines
 from companion.config.yaml_strict import read_document
+from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
 from tests.analysis.recorded import record
+from tests.commands import companion, refused
 
 ERROR = 0.05
 """Of the hover thrust that was flown with."""
@@ -38,10 +39,9 @@ def recorded(flown: tuple[FlightLog, float], tmp_path_factory: pytest.TempPathFa
 
 
 def test_it_prints_the_truth_and_what_to_write_into_the_vehicle_file(
-    flown: tuple[FlightLog, float], recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    flown: tuple[FlightLog, float], recorded: Path, tmp_path: Path
 ) -> None:
-    assert cli.main(["hover", "fit", str(recorded)]) == 0
-    out = capsys.readouterr().out
+    out = companion("hover", "fit", recorded).out
     value = re.search(r"^hover thrust +(0\.\d{4}) ± (0\.\d{4}) \(standard error\), from (\d+\.\d) s", out)
     assert value is not None, out
     assert float(value[1]) == pytest.approx(flown[1], rel=0.005)
@@ -57,10 +57,9 @@ def test_it_prints_the_truth_and_what_to_write_into_the_vehicle_file(
     assert read_document(patch).data == {"airframe": {"hover_thrust": float(value[1])}}
 
 
-def test_the_value_that_it_gives_is_one_that_flies(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_value_that_it_gives_is_one_that_flies(recorded: Path) -> None:
     """As JSON; the patch is a value that the vehicle file takes."""
-    assert cli.main(["hover", "fit", str(recorded), "--json"]) == 0
-    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    told: dict[str, Any] = json.loads(companion("hover", "fit", recorded, "--json").out)
     assert set(told) == set(
         jsonable(
             HoverFit(
@@ -83,7 +82,7 @@ def test_the_value_that_it_gives_is_one_that_flies(recorded: Path, capsys: pytes
 
 
 def test_a_log_that_never_hovered_and_a_file_that_is_no_log_are_refused_in_one_line(
-    flown: tuple[FlightLog, float], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    flown: tuple[FlightLog, float], tmp_path: Path
 ) -> None:
     log = flown[0]
     ground = sum(o.mission_t_s == 0.0 for o in log.outputs)
@@ -97,12 +96,8 @@ def test_a_log_that_never_hovered_and_a_file_that_is_no_log_are_refused_in_one_l
         (text, "not an MCAP file"),
         (tmp_path / "absent.mcap", "No such file"),
     ):
-        assert cli.main(["hover", "fit", str(path)]) == 2
-        told = capsys.readouterr()
-        assert told.out == ""
-        assert told.err.startswith(f"{path}: ")
-        assert reason in told.err
-        assert told.err.count("\n") == 1
+        line = refused(EXIT_BAD_INPUT, "hover", "fit", path)
+        assert line.startswith(f"{path}: ") and reason in line
 
 
 def test_a_slope_is_reported_with_the_voltage_that_the_value_holds_for() -> None:

@@ -11,14 +11,15 @@ from pathlib import Path
 import pytest
 
 from companion.analysis.log import FlightLog, LogError
-from companion.cli import main as cli
 from companion.cli.identify import RESULT, WORLD
 from companion.commissioning.identify.identification import identify
 from companion.config.loader import load_vehicle
+from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.sitl_config.loader import load_sitl, load_world
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
 from tests.analysis.recorded import record
+from tests.commands import companion, refused
 from tests.support import CATCH, ROOT
 
 SEED = 9
@@ -80,13 +81,12 @@ def test_the_stated_intervals_hold_the_truth_and_are_narrow(flown: tuple[FlightL
 
 
 def test_it_writes_a_world_and_a_vehicle_file_that_load(
-    flown: tuple[FlightLog, dict[str, float]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    flown: tuple[FlightLog, dict[str, float]], tmp_path: Path
 ) -> None:
     log = record(flown[0], tmp_path / "flight.mcap")
     vehicle = Path(shutil.copy(ROOT / "configs/vehicles/tarot650_2r.yaml", tmp_path / "mine.yaml"))
     before = vehicle.read_bytes()
-    assert cli.main(["identify", str(log), "--vehicle", str(vehicle), "--apply"]) == 0
-    printed = capsys.readouterr().out
+    printed = companion("identify", log, "--vehicle", vehicle, "--apply").out
     result = json.loads((tmp_path / RESULT).read_text(encoding="utf-8"))
     values = {one["key"]: one["value"] for one in result["quantities"]}
     assert all(one["title"] in printed for one in result["quantities"])
@@ -121,6 +121,5 @@ def test_a_log_that_shows_nothing_is_refused_in_one_line(
     assert "\n" not in str(refused.value)
 
 
-def test_a_missing_log_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["identify", str(tmp_path / "none.mcap")]) == 2
-    assert "none.mcap: cannot be read" in capsys.readouterr().err
+def test_a_missing_log_is_refused(tmp_path: Path) -> None:
+    assert "none.mcap: cannot be read" in refused(EXIT_BAD_INPUT, "identify", tmp_path / "none.mcap")

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import math
 import socket
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,15 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.io.protocols import DeviceError
 from companion.io.px4 import params as autopilot_params
+from companion.io.px4 import questions
 from companion.model.estimator import EstimatorReport
 from companion.model.types import AttitudeSetpoint, AutopilotRequest
 from tests.io.px4_peer import PARAMS, Px4Peer
 from tests.io.test_px4 import ARM_DISARM, armed, edge, linked, refused
 from tests.support import eventually, free_udp_port
 from tests.wires import serial_line
+
+ASK_ORIGIN = mavlink.MAV_CMD_REQUEST_MESSAGE
 
 
 async def test_parameters_and_firmware_are_read_from_the_wire_and_parameters_written() -> None:
@@ -194,3 +198,46 @@ def test_mavsdks_own_log_goes_to_python_logging_and_not_to_the_terminal(
     assert any("MAVSDK version" in record.message for record in caplog.records)
     captured = capfd.readouterr()
     assert captured.out == captured.err == ""
+
+
+async def test_a_question_is_repeated_until_it_is_answered() -> None:
+    async with linked() as (peer, autopilot):
+        peer.acks[ASK_ORIGIN] = None
+        before = len(peer.commands(ASK_ORIGIN))
+        asking = asyncio.create_task(autopilot.ensure_origin())
+        await eventually(lambda: len(peer.commands(ASK_ORIGIN)) >= before + 2, "the question, twice")
+        peer.acks[ASK_ORIGIN] = mavlink.MAV_RESULT_ACCEPTED
+        assert await asking
+
+
+async def test_a_question_that_px4_never_answers_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(questions, "ASKS", 2)
+
+    async with linked() as (peer, autopilot):
+        peer.acks[ASK_ORIGIN] = None
+        with pytest.raises(DeviceError, match=r"global origin, found no answer within 1 s; check the link$"):
+            await autopilot.ensure_origin()
+
+
+class _SlowLoop(asyncio.SelectorEventLoop):
+    """Its clock runs at a fiftieth of the computer's, as simulated time does on a computer that is very busy."""
+
+    def time(self) -> float:
+        return time.monotonic() / 50.0
+
+
+def test_on_a_slow_clock_a_late_answer_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(questions, "ASKS", 1)
+
+    async def fly() -> None:
+        async with linked() as (peer, autopilot):
+            peer.acks[ASK_ORIGIN] = None
+            before = len(peer.commands(ASK_ORIGIN))
+            asking = asyncio.create_task(autopilot.ensure_origin())
+            await eventually(lambda: len(peer.commands(ASK_ORIGIN)) > before, "the question")
+            await asyncio.to_thread(time.sleep, 2 * questions.REPEAT_S)
+            peer.say(mavlink.MAVLink_command_ack_message(ASK_ORIGIN, mavlink.MAV_RESULT_ACCEPTED))
+            assert await asking
+
+    with asyncio.Runner(loop_factory=_SlowLoop) as runner:
+        runner.run(fly())
