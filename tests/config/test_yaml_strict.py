@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.config.document import LINE_MAX, ConfigError, Origin
+from companion.config.document import LINE_MAX, ConfigError, Document, Origin
 from companion.config.yaml_strict import SIZE_MAX_BYTES, parse_value, read_document
 
 
@@ -38,6 +38,12 @@ def test_scalars_are_those_of_yaml_1_2(text: str, value: object) -> None:
     parsed = parse_value(text, Origin("test"))
     assert parsed == value
     assert type(parsed) is type(value)
+
+
+def read(folder: Path, content: str | bytes) -> Document:
+    path = folder / "f.yaml"
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return read_document(path, "f.yaml")
 
 
 BAD = [
@@ -73,10 +79,8 @@ BAD = [
 
 @pytest.mark.parametrize(("text", "lines"), BAD, ids=range(len(BAD)))
 def test_refused_text_is_reported_in_one_line_per_problem(tmp_path: Path, text: str, lines: list[str] | None) -> None:
-    path = tmp_path / "f.yaml"
-    path.write_text(text, encoding="utf-8")
     try:
-        document = read_document(path, "f.yaml")
+        document = read(tmp_path, text)
     except ConfigError as error:
         found = list(error.lines)
     else:
@@ -88,9 +92,7 @@ def test_refused_text_is_reported_in_one_line_per_problem(tmp_path: Path, text: 
 
 @pytest.mark.parametrize("character", ["\x85", "\u2028", "\u2029"])
 def test_a_separator_of_yaml_1_1_ends_neither_a_comment_nor_a_line(tmp_path: Path, character: str) -> None:
-    path = tmp_path / "f.yaml"
-    path.write_text(f"a: 1  # copied{character}b: 2\nc: 'x{character}y\u00a0'\nc: 3\n", encoding="utf-8")
-    document = read_document(path, "f.yaml")
+    document = read(tmp_path, f"a: 1  # copied{character}b: 2\nc: 'x{character}y\u00a0'\nc: 3\n")
     assert document.data == {"a": 1, "c": f"x{character}y\u00a0"}
     assert [str(problem.origin) for problem in document.problems] == ["f.yaml:3:1"]
 
@@ -111,30 +113,22 @@ def test_what_is_no_file_is_refused(tmp_path: Path, name: str, refusal: str) -> 
 
 
 def test_not_utf_8(tmp_path: Path) -> None:
-    path = tmp_path / "f.yaml"
-    path.write_bytes(b"a: 1\nname: caf\xe9\n")
     with pytest.raises(ConfigError, match=r"^f.yaml:2: not UTF-8 \(byte 0xe9\); save the file as UTF-8$"):
-        read_document(path, "f.yaml")
+        read(tmp_path, b"a: 1\nname: caf\xe9\n")
 
 
 def test_a_byte_order_mark_and_a_character_in_two_halves_are_accepted(tmp_path: Path) -> None:
-    path = tmp_path / "f.yaml"
-    path.write_bytes(b'\xef\xbb\xbfa: "\\U0001F600"\n')
-    document = read_document(path)
+    document = read(tmp_path, b'\xef\xbb\xbfa: "\\U0001F600"\n')
     assert (document.data, document.problems) == ({"a": "\U0001f600"}, [])
 
 
 def test_too_large_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "f.yaml"
-    path.write_bytes(b"#" * (SIZE_MAX_BYTES + 1))
     with pytest.raises(ConfigError, match=r"^f\.yaml: larger than 256 KiB; expected a configuration file"):
-        read_document(path, "f.yaml")
+        read(tmp_path, b"#" * (SIZE_MAX_BYTES + 1))
 
 
 def test_places_of_values_and_keys(tmp_path: Path) -> None:
-    path = tmp_path / "f.yaml"
-    path.write_text("a:\n  - b: 1\n    c: [2, 3]\n")
-    document = read_document(path, "f.yaml")
+    document = read(tmp_path, "a:\n  - b: 1\n    c: [2, 3]\n")
     assert str(document.origin(("a", 0, "c", 1))) == "f.yaml:3:12"
     assert str(document.key_origin(("a", 0, "c"))) == "f.yaml:3:5"
     assert str(document.origin(("a", 0, "missing"))) == "f.yaml:2:5"
