@@ -29,6 +29,7 @@ from companion.safety.rotor_stop import DISARM_STILL_S
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
+from tests.flights.ends import Changed
 from tests.safety.healthy import healthy, put
 from tests.support import CATCH, SHORT_CATCH
 
@@ -166,11 +167,7 @@ class Dies:
 def flown(
     died_s: float, back_s: float, change: Change = lambda i: i, mission: Path = SHORT_CATCH
 ) -> tuple[FastFlight, FastResult]:
-    class Flight(FastFlight):
-        def _inputs(self, tick: int) -> Inputs:
-            return change(super()._inputs(tick))
-
-    flight = Flight(load_sitl(mission))
+    flight = Changed(load_sitl(mission), change)
     flight.core = Dies(flight.config, died_s, back_s)  # type: ignore[assignment]
     return flight, flight.run()
 

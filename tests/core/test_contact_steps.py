@@ -13,10 +13,10 @@ from companion.core.flight_state import FlightState, Request
 from companion.core.transition import Parameters
 from companion.mission.plan import Plan
 from companion.model.contact import ContactMode, ContactState, TouchedPoint
-from companion.model.types import Inputs, Outcome, Vec3
+from companion.model.types import Inputs, Outcome, SafetyAction, Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact.base import opening_of
-from tests.core.test_reactions import ids, in_plan, tick
+from tests.core.test_reactions import HERE, after, ids, in_plan, tick
 from tests.safety.healthy import healthy, put
 
 CONFIG = load_flight("configs/missions/press.yaml", overrides=["mission.phases[3].face_m=null"])
@@ -220,6 +220,15 @@ def test_after_a_failed_contact_the_rest_is_skipped_and_the_plan_goes_on_where_i
     assert state.expected.contact is None and state.skips
     assert state.course is not None and not state.course.held
     assert plan_s(state) < PRESS.end_s - 1.0
+
+
+def test_a_landing_during_a_press_leads_back_from_the_surface_first() -> None:
+    state, _ = step(pressing(), 5.0)
+    state, _ = after(state, "operator_land", SafetyAction.LAND, parameters=P)
+    assert state.course is not None and state.expected.contact is None
+    plan, (x, y, z) = state.course.plan, HERE
+    assert plan.segments[0].name == "back"
+    assert plan.reference(plan.segments[0].end_s).position_world_m == pytest.approx((x - 0.2, y, z), abs=1e-3)
 
 
 @pytest.mark.parametrize("force_n", [4.9, 5.0])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import msgspec
 
@@ -18,10 +17,11 @@ from companion.model.types import (
     Vec3,
 )
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.autopilot.autopilot import Px4Stub
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from sitl.mocap import MocapFrame
+from tests.core.walk import Deaf
+from tests.flights.ends import Changed
 from tests.safety.healthy import put
 from tests.support import HOVER, SHORT_CATCH
 
@@ -30,16 +30,14 @@ Change = Callable[[Inputs], Inputs]
 STANDS_M = load_sitl("configs/missions/catch.yaml").vehicle.airframe.ground_clearance_m
 
 
-def configured(mission: Path) -> SitlConfig:
-    return load_sitl(mission, preset="recommended")
+SHORT_HOVER = ("mission.phases[1].duration_s=3.0",)
 
 
-class Spoiled(FastFlight):
+class Spoiled(Changed):
     """Motion capture that has the floor elsewhere, and what else the companion is reported wrong."""
 
     def __init__(self, config: SitlConfig, change: Change, lift_m: float) -> None:
-        super().__init__(config)
-        self._change = change
+        super().__init__(config, change)
         plant, take = self.plant, self.plant.mocap.take
 
         def lifted() -> list[MocapFrame]:
@@ -50,30 +48,13 @@ class Spoiled(FastFlight):
 
         plant.mocap.take = lifted  # type: ignore[method-assign]
 
-    def _inputs(self, tick: int) -> Inputs:
-        return self._change(super()._inputs(tick))
-
-
-class Deaf:
-    """A land detector that never finds anything."""
-
-    landed = maybe_landed = ground_contact = False
-
-    def __init__(self, px4: Px4Stub) -> None:
-        self._real = px4.land
-
-    def update(self, *arguments: object, **named: object) -> None:
-        if not arguments[1]:  # disarmed
-            self.landed = self.maybe_landed = self.ground_contact = True
-        else:
-            self.landed = self.maybe_landed = self.ground_contact = False
-
 
 def flown(change: Change = lambda i: i, lift_m: float = 0.0, *, deaf: bool = False) -> tuple[FastFlight, FastResult]:
     # The error of the height takes 8 s to come.
-    flight = Spoiled(configured(HOVER if lift_m else SHORT_CATCH), change, lift_m)
+    config = load_sitl(HOVER, overrides=SHORT_HOVER) if lift_m else load_sitl(SHORT_CATCH)
+    flight = Spoiled(config, change, lift_m)
     if deaf:
-        flight.px4.land = Deaf(flight.px4)  # type: ignore[assignment]
+        flight.px4.land = Deaf()  # type: ignore[assignment]
     return flight, flight.run()
 
 

@@ -15,6 +15,7 @@ from companion.model.outputs import Outputs
 from companion.model.types import AutopilotRequest, FlightMode, Inputs, Outcome
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
+from tests.flights.ends import Changed
 from tests.safety.healthy import put
 
 replace = msgspec.structs.replace
@@ -23,15 +24,6 @@ Change = Callable[[Inputs], Inputs]
 
 def configured(*overrides: str) -> SitlConfig:
     return load_sitl("configs/missions/hover.yaml", overrides=overrides)
-
-
-class Changed(FastFlight):
-    def __init__(self, change: Change) -> None:
-        super().__init__(configured())
-        self._change = change
-
-    def _inputs(self, tick: int) -> Inputs:
-        return self._change(super()._inputs(tick))
 
 
 def off_by(x_m: float, yaw_deg: float, *, until_s: float = math.inf, swing_s: float | None = None) -> Change:
@@ -67,7 +59,7 @@ def test_an_estimate_that_has_not_settled_is_refused_and_named(
     change: Change, drifts: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(seq, "WAIT_TIMEOUT_S", 3.0)
-    result = Changed(change).run(limit_s=20.0)
+    result = Changed(configured(), change).run(limit_s=20.0)
     assert result.outputs[-1].outcome is Outcome.REFUSED
     [(id_, text)] = events(result.outputs)
     assert id_ == "estimate_unsteady"
@@ -78,11 +70,11 @@ def test_an_estimate_that_has_not_settled_is_refused_and_named(
 
 
 def test_it_takes_off_a_second_after_the_estimate_has_settled() -> None:
-    result = Changed(off_by(0.06, 0.0, until_s=3.0)).run(limit_s=8.0)
+    result = Changed(configured(), off_by(0.06, 0.0, until_s=2.0)).run(limit_s=7.5)
     assert [id_ for id_, _ in events(result.outputs)] == ["takeoff"]
     asked_s = next(o.t_s for o in result.outputs if o.request is AutopilotRequest.OFFBOARD)
     # The mean of a second is near long before the spread has become small.
-    assert 3.0 + 0.85 * seq.TARE_S < asked_s - seq.STREAM_BEFORE_OFFBOARD_S < 3.0 + 1.1 * seq.TARE_S
+    assert 2.0 + 0.85 * seq.TARE_S < asked_s - seq.STREAM_BEFORE_OFFBOARD_S < 2.0 + 1.1 * seq.TARE_S
 
 
 def test_an_ordinary_start_waits_for_no_more_than_the_tare() -> None:

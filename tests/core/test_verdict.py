@@ -20,7 +20,7 @@ from companion.model.outputs import Outputs
 from companion.model.types import FlightMode, Inputs, OperatorCommand, Outcome, SafetyAction
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
-from tests.flights.ends import flown_until
+from tests.flights.ends import Changed, flown_until
 from tests.flights.test_ladder_flights import TAUT
 from tests.safety.healthy import put
 from tests.support import HOVER, LOW_HOVER
@@ -57,14 +57,13 @@ class Commanded:
         return next(o for o in self.outputs if o.t_s >= t_s)
 
 
-class _Asking(FastFlight):
+class _Asking(Changed):
     def __init__(self, script: Script, change: Change, *overrides: str) -> None:
-        super().__init__(load_sitl("configs/missions/hover.yaml", overrides=overrides))
+        super().__init__(load_sitl("configs/missions/hover.yaml", overrides=overrides), change)
         self._script = list(script)
-        self._change = change
 
     def _inputs(self, tick: int) -> Inputs:
-        i = self._change(super()._inputs(tick))
+        i = super()._inputs(tick)
         if self._script and i.t_s >= self._script[0][0]:
             return msgspec.structs.replace(i, command=self._script.pop(0)[1])
         return i
@@ -187,13 +186,9 @@ def test_commands_while_it_goes_back_along_the_tether() -> None:
     assert flown.effects[2] == (True, "landing")
 
 
-def test_too_low_to_hold_and_in_the_missions_own_landing() -> None:
+def test_too_low_to_hold() -> None:
     flown = commanded((6.1, HOLD), until_s=6.7)
     assert flown.effects == [(True, "too low to hold: landing")]
-    begin_s = times_of(ordinary())["land"]
-    flown = commanded((begin_s + 0.2, HOLD), (begin_s + 0.4, RESUME), sets=LOW)
-    assert flown.effects == [(False, "hold refused: the vehicle is landing"), (True, "the landing continues")]
-    assert flown.outcome is Outcome.COMPLETED
 
 
 def test_nothing_is_done_against_a_pilot() -> None:
@@ -271,14 +266,22 @@ def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
     assert flown.effects[1::2] == [(False, "resume refused: on the ground")] * 4
 
 
-def test_it_waits_for_start_with_nothing_sent_and_then_flies() -> None:
-    flown = commanded((2.0, HOLD), (3.0, START), sets=(*WAITS, *LOW))
-    assert flown.effects == [(True, "the vehicle stays on the ground until start is commanded"), (True, "taking off")]
+def test_it_waits_for_start_with_nothing_sent_and_then_flies_and_a_landing_is_not_held() -> None:
+    lands_s = times_of(ordinary())["land"] + 1.0  # PX4's heartbeats come once a second
+    flown = commanded((2.0, HOLD), (3.0, START), (lands_s + 0.2, HOLD), (lands_s + 0.4, RESUME), sets=(*WAITS, *LOW))
+    assert flown.effects == [
+        (True, "the vehicle stays on the ground until start is commanded"),
+        (True, "taking off"),
+        (False, "hold refused: the vehicle is landing"),
+        (True, "the landing continues"),
+    ]
     waiting = [o for o in flown.outputs if o.phase == "waits for start"]
     assert waiting[-1].t_s - waiting[0].t_s > 1.0
     assert all(o.attitude is None and o.arm_torque_nm is None and o.request.value == "none" for o in waiting)
     assert flown.outcome is Outcome.COMPLETED
-    assert [id_ for id_ in flown.ids if id_ != "catch"] == ["operator_start", "takeoff", "touchdown"]
+    assert [id_ for id_ in flown.ids if id_ != "catch"] == [
+        *("operator_start", "takeoff", "operator_hold", "operator_resume", "touchdown")
+    ]
 
 
 @pytest.mark.parametrize("command", [LAND, ABORT])

@@ -1,4 +1,4 @@
-"""When a flight of the fast loop may end: what is judged has happened."""
+"""When a flight of the fast loop may end, because what is judged has happened, and a flight with changed inputs."""
 
 from __future__ import annotations
 
@@ -6,8 +6,21 @@ import math
 from collections.abc import Callable
 
 from companion.model.outputs import Outputs
+from companion.model.types import Inputs
+from companion.sitl_config.loader import SitlConfig
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
+
+
+class Changed(FastFlight):
+    """A flight whose core receives changed inputs."""
+
+    def __init__(self, config: SitlConfig, change: Callable[[Inputs], Inputs]) -> None:
+        super().__init__(config)
+        self._change = change
+
+    def _inputs(self, tick: int) -> Inputs:
+        return self._change(super()._inputs(tick))
 
 
 def flown_until(flight: FastFlight, until: Callable[[Outputs], bool]) -> FastResult:

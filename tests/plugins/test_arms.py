@@ -27,7 +27,7 @@ from companion.io.protocols import DeviceError
 from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.launcher_messages import WorldMessage, WorldProgress
 from companion.model.observations import ArmStatement, Observations
-from companion.model.types import ArmState
+from companion.model.types import ArmState, SafetyAction
 from companion.plugins import ARMS
 from companion.preflight.arm import rows
 from companion.runtime.clock import flight_clock
@@ -41,6 +41,7 @@ from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from sitl.wires import MachineWires, Ports
 from sitl.world.start import start_of
+from tests.flights.ends import after
 from tests.plugins.arms import NAMES, SCRIPTED, ODrives
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import ROOT, SHORT_CATCH
@@ -413,7 +414,7 @@ async def test_an_arm_of_strong_motors_opens_in_the_simulated_world() -> None:
         assert arm.write_torque((20.0, -0.5)) == pytest.approx((20.0, -0.5), abs=0.02)
 
 
-def test_a_vehicle_with_another_arm_completes_the_catch_in_the_fast_loop(tmp_path: Path) -> None:
+def test_a_vehicle_with_another_arm_catches_in_the_fast_loop(tmp_path: Path) -> None:
     config = load_sitl(SHORT_CATCH, vehicle_file(tmp_path, "type: moteus"))
-    result = FastFlight(config).run()
-    assert result.outputs[-1].outcome is not None and result.outputs[-1].outcome.value == "completed"
+    result = FastFlight(config).run(until=after("catch", 0.5))
+    assert result.caught and not result.crashed and result.outputs[-1].action is SafetyAction.NOMINAL

@@ -149,7 +149,7 @@ RAISES = {
 }
 SOON = [
     "mission.catch=null",
-    "mission.phases[0]={type: takeoff, height_m: 0.9, duration_s: 2.5}",
+    "mission.phases[0]={type: takeoff, height_m: 0.8, duration_s: 2.0}",
     "mission.phases[2]={type: arm, arm_deg: unfolded}",
     "mission.phases[3].duration_s=0.1",
 ]
