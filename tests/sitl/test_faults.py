@@ -9,20 +9,16 @@ from typing import Any
 import pytest
 
 from companion.campaigns.faults.judge import good
-from companion.campaigns.process import CampaignError
 from companion.campaigns.runner import Row
-from companion.cli.main import main
 from companion.config.document import ConfigError
 from companion.mission.plan import Plan
-from companion.model.exit_codes import EXIT_BAD_INPUT
 from companion.model.flight_stage import SPOOL_S
 from companion.model.frames import attitude_ned_frd_from_enu_flu
 from companion.model.types import Event, Outcome, Quat, SafetyAction, Vec3
 from companion.safety.stop import StopModel
 from companion.sitl_config.faults import KINDS, FaultKind, FlightPhase
 from companion.sitl_config.loader import SitlConfig, load_sitl
-from sitl.campaigns.faults import fly, prepare
-from sitl.campaigns.robustness import draw, throws
+from sitl.campaigns.faults import fly
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from sitl.faults.timing import FaultError, with_fault_times
@@ -38,10 +34,8 @@ def with_faults(*faults: dict[str, Any], mission: Any = CATCH, world: str = "wor
     return load_sitl(mission, overrides=[f"world.faults={json.dumps(list(faults))}", world])
 
 
-def flown(
-    kind: FaultKind, phase: FlightPhase, size: float | None = None, config: SitlConfig = SHORT, duration_s: Any = None
-) -> Row:
-    row: Row = fly(config, {"kind": kind, "size": size, "duration_s": duration_s, "phase": phase})["row"]
+def flown(kind: FaultKind, phase: FlightPhase, size: float | None = None, config: SitlConfig = SHORT) -> Row:
+    row: Row = fly(config, {"kind": kind, "size": size, "duration_s": None, "phase": phase})["row"]
     return row
 
 
@@ -75,15 +69,11 @@ def test_a_phase_is_a_time_of_the_plan() -> None:
 def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
     with pytest.raises(FaultError, match="mission 'hover' has no phase 'return'; give t_s instead"):
         with_fault_times(with_faults({"kind": "mocap_loss", "phase": "return"}, mission=HOVER))
-    with pytest.raises(CampaignError) as refused:
-        prepare({"flights": [{"phase": "return"}]}, [load_sitl(HOVER)])
-    assert refused.value.bad_input
 
 
 @pytest.mark.parametrize(
     ("fault", "problem"),
     [
-        ({"kind": "mocap_loss"}, "give either t_s or phase"),
         ({"kind": "mocap_loss", "t_s": 1.0, "phase": "line"}, "give either t_s or phase"),
         ({"kind": "mocap_loss", "t_s": 1.0, "size": 2.0}, "a mocap_loss has no size"),
         ({"kind": "gust", "t_s": 1.0, "size": -2.0}, "must not be negative"),
@@ -91,11 +81,9 @@ def test_a_mission_without_a_way_back_has_no_such_phase() -> None:
         ({"kind": "mocap_rate", "t_s": 1.0, "size": 0.0}, "must be above 0"),
     ],
 )
-def test_a_fault_that_means_nothing_is_refused(
-    fault: dict[str, Any], problem: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["check", str(CATCH), "--set", f"world.faults={json.dumps([fault])}"]) == EXIT_BAD_INPUT
-    assert problem in capsys.readouterr().err
+def test_a_fault_that_means_nothing_is_refused(fault: dict[str, Any], problem: str) -> None:
+    with pytest.raises(ConfigError, match=problem):
+        with_faults(fault)
 
 
 def test_a_fault_of_a_part_that_vehicle_or_world_do_not_have_is_refused() -> None:
@@ -184,26 +172,38 @@ def test_without_faults_the_flight_is_the_same_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "phase", "size", "duration_s", "end"),
+    ("kind", "phase", "size", "end"),
     [
-        ("mocap_latency", "line", 0.2, None, ("landed", "mocap_lost", "autopilot_land")),
-        ("link_delay", "line", 0.08, None, ("landed", "link_late", "autopilot_land")),
-        ("offboard_refused", "landing", None, None, ("landed", "offboard_left", "autopilot_land")),
-        ("arming_refused", "ground", None, None, ("refused", "arming_refused", "nominal")),
-        ("servo_overload", "line", None, None, ("landed", "servo_error", "land")),
-        ("servo_angle", "line", 40.0, None, ("landed", "joint_jump", "land")),
-        ("bus_noise", "takeoff", 0.6, None, ("completed", "arm_read_failures", "warn")),
-        ("force_stuck", "line", None, None, ("completed", "force_stuck", "warn")),
-        ("kill_recorder", "landing", None, None, ("completed", "recorder_drops", "warn")),
-        ("stall_loop", "line", None, 0.06, ("completed", "loop_late", "warn")),
+        ("mocap_latency", "line", 0.2, ("landed", "mocap_lost", "autopilot_land")),
+        ("link_delay", "line", 0.08, ("landed", "link_late", "autopilot_land")),
+        ("offboard_refused", "landing", None, ("landed", "offboard_left", "autopilot_land")),
+        ("arming_refused", "ground", None, ("refused", "arming_refused", "nominal")),
+        ("servo_overload", "line", None, ("landed", "servo_error", "land")),
+        ("servo_angle", "line", 40.0, ("landed", "joint_jump", "land")),
     ],
 )  # fmt: skip
 def test_it_ends_well_and_is_reported(
-    kind: FaultKind, phase: FlightPhase, size: float | None, duration_s: float | None, end: tuple[str, ...]
+    kind: FaultKind, phase: FlightPhase, size: float | None, end: tuple[str, ...]
 ) -> None:
-    row = flown(kind, phase, size, duration_s=duration_s)
+    row = flown(kind, phase, size)
     assert good(row), row["problems"]
     assert (row["outcome"], row["event"], row["action"]) == end, row["events"]
+
+
+def test_a_flight_with_four_faults_that_only_warn_and_a_gap_shorter_than_the_timeout_completes() -> None:
+    faults = (
+        {"kind": "bus_noise", "phase": "takeoff", "size": 0.6},
+        {"kind": "mocap_loss", "phase": "takeoff", "duration_s": 0.1},
+        {"kind": "stall_loop", "phase": "line", "duration_s": 0.06},
+        {"kind": "force_stuck", "phase": "line"},
+        {"kind": "kill_recorder", "phase": "landing"},
+    )
+    _, _, result, events = fault_and_events(with_faults(*faults, mission=SHORT_CATCH))
+    warned = {name for name, event in events.items() if event.action is not SafetyAction.NOMINAL}
+    assert warned >= {"arm_read_failures", "loop_late", "force_stuck", "recorder_drops"}
+    assert not any(name.startswith("mocap") for name in warned)
+    assert {o.action for o in result.outputs} == {SafetyAction.NOMINAL, SafetyAction.WARN}
+    assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed and not result.armed
 
 
 def test_a_tether_that_holds_it_brings_it_down() -> None:
@@ -211,13 +211,6 @@ def test_a_tether_that_holds_it_brings_it_down() -> None:
     assert good(row), row["problems"]
     assert row["outcome"] == "landed"
     assert {"tether_taut", "tether_snagged"} & set(row["events"])
-
-
-def test_mocap_lost_in_the_middle_of_the_line() -> None:
-    row = flown("mocap_loss", "line", config=CONFIG)
-    assert row["outcome"] == "landed"
-    assert row["reacted_s"] <= CONFIG.vehicle.safety.mocap_timeout_s + 0.03
-    assert row["drift_m"] <= StopModel(CONFIG.vehicle.safety).distance_m(LINE_M_S)
 
 
 def test_a_vehicle_that_px4_lands_with_a_drifting_estimate_is_stopped_when_it_stands() -> None:
@@ -291,28 +284,6 @@ def test_a_delay_behind_the_servers_stamp_is_reported_and_ends_well() -> None:
     assert good(row) and row["drift_m"] < 0.6
 
 
-def test_poses_dragged_at_0_3_m_s_are_found_and_px4_lands_before_they_moved_it_0_6_m() -> None:
-    """PX4 fuses the dragged poses, so its position agrees with them; the IMU does not. With the limit of a quiet IMU."""
-    sharp = CONFIG.vehicle.safety.model_copy(update={"mocap_inertial_m": 0.015})
-    config = with_faults({"kind": "mocap_drag", "phase": "line", "size": 0.3}, mission=SHORT_CATCH)
-    vehicle = config.vehicle.model_copy(update={"safety": sharp})
-    begun_s, _, result, events = fault_and_events(config.model_copy(update={"vehicle": vehicle}))
-    first = min(events.values(), key=lambda event: event.t_s)
-    assert (first.id, first.action) == ("mocap_dragged", SafetyAction.AUTOPILOT_LAND)
-    assert first.t_s - begun_s < 0.2
-    assert not any(outputs.mocap_trusted for outputs in result.outputs if outputs.t_s >= first.t_s)
-    assert_lands_near(result, begun_s)
-
-
-def test_a_catch_in_a_drawn_world_is_no_drag() -> None:
-    """Wind, delays, mass errors and the impact of the payload: one of the flights from which the threshold was chosen."""
-    knobs = draw(11, 7, throws(CONFIG.mission, CONFIG.vehicle))
-    drawn = [f"world.{key}={json.dumps(value)}" for key, value in knobs.items()]
-    result = FastFlight(load_sitl(CATCH, overrides=drawn, world="robustness")).run(until_mission_s=8.0)
-    assert result.caught
-    assert "mocap_dragged" not in {event.id for outputs in result.outputs for event in outputs.events}
-
-
 def test_after_a_gap_another_bodys_pose_does_not_reach_px4_which_lands_without_it() -> None:
     """PX4 would reset its position to the first pose: this flight ended 4 m away, on its tether (laboratory 1)."""
     faults = ({"kind": "mocap_loss", "duration_s": 1.5}, {"kind": "mocap_swap", "size": 0.8})
@@ -323,35 +294,30 @@ def test_after_a_gap_another_bodys_pose_does_not_reach_px4_which_lands_without_i
     assert_lands_near(result, begun_s)
 
 
-def test_after_a_gap_the_vehicles_own_poses_are_used_again() -> None:
-    gap_s = 2.0
-    begun_s, _, result, _ = fault_and_events(
+def test_poses_lost_on_the_line_end_in_a_landing_and_after_the_gap_the_vehicles_own_are_used_again() -> None:
+    gap_s, safety = 2.0, CONFIG.vehicle.safety
+    begun_s, _, result, events = fault_and_events(
         with_faults({"kind": "mocap_loss", "phase": "line", "duration_s": gap_s}, mission=SHORT_CATCH)
     )
+    assert events["mocap_lost"].t_s - begun_s <= safety.mocap_timeout_s + 0.03
     back = [o.mocap_trusted for o in result.outputs if o.t_s > begun_s + gap_s + 0.1]
     assert back and all(back)
+    at_fault = next(truth for truth in result.truth if truth.t_s >= begun_s)
+    drift_m = max(
+        math.dist(at_fault.position_world_m[:2], t.position_world_m[:2]) for t in result.truth if t.t_s >= begun_s
+    )
+    assert drift_m <= StopModel(safety).distance_m(LINE_M_S)
     assert not result.crashed and not result.armed
 
 
-def test_a_gap_shorter_than_the_timeout_is_flown_through() -> None:
-    row = flown("mocap_loss", "line", duration_s=0.1)
-    assert (row["outcome"], row["action"]) == ("completed", "nominal")
-    assert row["drift_m"] < 0.05
-
-
-def test_a_second_payload_is_carried_too() -> None:
-    fault = {"kind": "payload_double", "after": "catch", "t_s": 0.2, "size": 0.2}
-    begun_s, _, result, _ = fault_and_events(with_faults(fault, mission=SHORT_CATCH))
-    assert _load_n(result, begun_s + 1.5) == pytest.approx(0.4 * 9.81, abs=0.6)
-
-
-def test_a_payload_that_is_dropped_is_felt_no_more() -> None:
-    fault = {"kind": "payload_dropped", "after": "catch", "t_s": 1.0}
-    begun_s, _, result, _ = fault_and_events(with_faults(fault, mission=SHORT_CATCH))
+def test_a_second_payload_is_carried_too_and_one_that_is_dropped_is_felt_no_more() -> None:
+    second = {"kind": "payload_double", "after": "catch", "t_s": 0.2, "size": 0.2}
+    dropped = {"kind": "payload_dropped", "after": "catch", "t_s": 1.2}
+    begun_s, _, result, _ = fault_and_events(with_faults(second, dropped, mission=SHORT_CATCH))
     assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed
     assert {o.action for o in result.outputs} == {SafetyAction.NOMINAL}
-    assert _load_n(result, begun_s - 0.3) == pytest.approx(0.2 * 9.81, abs=0.5)
-    assert _load_n(result, begun_s + 1.0) == pytest.approx(0.0, abs=0.4)
+    assert _load_n(result, begun_s + 0.7) == pytest.approx(0.4 * 9.81, abs=0.6)
+    assert _load_n(result, begun_s + 2.0) == pytest.approx(0.2 * 9.81, abs=0.5)
 
 
 def _load_n(result: FastResult, t_s: float) -> float:
