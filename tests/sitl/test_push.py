@@ -50,17 +50,15 @@ class Deflection(NamedTuple):
 class Pushed(NamedTuple):
     measured: Deflection
     ideal: Deflection
-    net_force_n: float
-    """Change of the sensor's y force while the push lasts, truth, N."""
 
 
 def peak(deflection: Array) -> float:
     return float(np.linalg.norm(deflection, axis=1).max())
 
 
-def push_config(preset: str, force_world_n: Vec3, base_rows: bool = False, *overrides: str) -> SitlConfig:
+def push_config(preset: str, force_world_n: Vec3, base_rows: bool = False) -> SitlConfig:
     """Take off, unfold the arm into the catch pose, hover, push; with `base_rows` the whole force enters the position rows."""
-    config = load_sitl("configs/missions/catch.yaml", preset=preset, overrides=overrides)
+    config = load_sitl("configs/missions/catch.yaml", preset=preset)
     phases = (
         Takeoff(type="takeoff", height_m=1.0, duration_s=TAKEOFF_S),
         ArmMove(type="arm", arm_deg=CATCH_POSE_DEG, duration_s=UNFOLD_S),
@@ -108,8 +106,8 @@ def ideal_deflection(config: SitlConfig, force_world_n: Vec3, t_s: Array) -> Def
 
 
 @cache
-def pushed(preset: str, force_world_n: Vec3, base_rows: bool = False, *overrides: str) -> Pushed:
-    config = push_config(preset, force_world_n, base_rows, *overrides)
+def pushed(preset: str, force_world_n: Vec3, base_rows: bool = False) -> Pushed:
+    config = push_config(preset, force_world_n, base_rows)
     flight = FastFlight(config)
     log = flight.run(limit_s=PUSH_AT_S + PUSH_S + AFTER_S + 3.2)
     armed_s = flight.plant.armed_t_s
@@ -120,18 +118,14 @@ def pushed(preset: str, force_world_n: Vec3, base_rows: bool = False, *overrides
         if outputs.reference is not None and -REST_S <= t_s <= PUSH_S + AFTER_S:
             at = (*truth.position_world_m, *truth.joint_angle_rad)
             to = (*outputs.reference.position_world_m, *outputs.reference.arm_rad)
-            rows.append((t_s, *(a - b for a, b in zip(at, to, strict=True)), truth.force_sensor_n[1]))
+            rows.append((t_s, *(a - b for a, b in zip(at, to, strict=True))))
     table = np.array(rows)
     assert table[-1, 0] > PUSH_S + AFTER_S - 0.02, "it did not stay in the air"
     before, after = table[table[:, 0] < 0.0], table[table[:, 0] >= 0.0]
-    # Link 2 stays in the body's x-z plane and the body is nearly level, so the sensor's y is the world's. The first half second
-    # is left out: while the machine is pushed aside, the net's own inertia takes a part.
-    steady = after[(after[:, 0] > 0.5) & (after[:, 0] < 0.95)]
     deflection = after[:, 1:6] - before[:, 1:6].mean(axis=0)
     return Pushed(
         Deflection(deflection[:, :3], deflection[:, 3:]),
         ideal_deflection(config, force_world_n, after[:, 0]),
-        float(steady[:, 6].mean() - before[:, 6].mean()),
     )
 
 
@@ -150,19 +144,19 @@ def test_the_ideal_arm_rests_where_its_stiffness_carries_the_force(monkeypatch: 
 
 @pytest.mark.parametrize(
     ("preset", "force", "base_rows", "within"),
-    [("paper", DOWN, False, 0.18), ("paper", DOWN, True, 0.18), ("recommended", DOWN, True, 0.15), ("recommended", BACK, True, 0.15)],
-)  # fmt: skip
+    [("paper", DOWN, False, 0.18), ("paper", DOWN, True, 0.18), ("recommended", BACK, True, 0.15)],
+)
 def test_the_arm_gives_way_as_its_impedance_says(preset: str, force: Vec3, base_rows: bool, within: float) -> None:
     """Joint friction of 0.04 N m takes up to 16 % of the deflection of a 2 N push from the paper's law, 7 % from ours."""
-    measured, ideal, _ = pushed(preset, force, base_rows)
+    measured, ideal = pushed(preset, force, base_rows)
     assert peak(measured.arm) == pytest.approx(peak(ideal.arm), rel=within)
     difference = np.sqrt(np.mean(np.sum((measured.arm - ideal.arm) ** 2, axis=1)))
     assert difference < 0.2 * peak(ideal.arm)
 
 
-@pytest.mark.parametrize("force", [DOWN, BACK, LEFT], ids=["down", "back", "left"])
+@pytest.mark.parametrize("force", [BACK, LEFT], ids=["back", "left"])
 def test_base_rows_make_the_base_as_compliant_as_it_should_be(force: Vec3) -> None:
-    measured, ideal, _ = pushed("recommended", force, True)
+    measured, ideal = pushed("recommended", force, True)
     assert 0.5 < peak(measured.base) / peak(ideal.base) < 2.0
 
 

@@ -12,19 +12,16 @@ from numpy.typing import NDArray
 
 from companion.config.loader import load_vehicle
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.types import Outcome, Vec2, Vec3
+from companion.model.types import Vec2, Vec3
 from companion.sitl_config.effects.net import Net
 from companion.sitl_config.faults import Fault
-from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
-from sitl.fast.loop import FastFlight
 from sitl.world.effects.net import Bag
 from sitl.world.model import SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
 from sitl.world.state import PHYSICS_DT_S
 from tests.sitl.plants import OneMachine, run
-from tests.sitl.test_throws import FIRST_MISSED, TO_AND_FRO
-from tests.support import SHORT_CATCH, tool_of
+from tests.support import tool_of
 
 Array = NDArray[np.float64]
 HOOP_M, PAYLOAD_RADIUS_M = 0.09, 0.035
@@ -84,7 +81,7 @@ def falling(
     return Point(bag, mass_kg, (*at, z_m), (0.0, 0.0, -speed_m_s), gravity)
 
 
-@pytest.mark.parametrize("mass_kg", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("mass_kg", [0.1, 0.3])
 def test_the_bag_stops_the_payload_in_a_quarter_period_of_its_spring(mass_kg: float) -> None:
     payload = falling(2.7, mass_kg, gravity=0.0)
     forces = []
@@ -97,7 +94,7 @@ def test_the_bag_stops_the_payload_in_a_quarter_period_of_its_spring(mass_kg: fl
     assert max(forces) == pytest.approx(2.7 * math.sqrt(mass_kg * 500.0), rel=0.06)
 
 
-@pytest.mark.parametrize("restitution", [0.0, 0.3, 0.6])
+@pytest.mark.parametrize("restitution", [0.0, 0.6])
 def test_the_bag_returns_the_restitution_of_the_speed(restitution: float) -> None:
     payload = falling(2.0, gravity=0.0, restitution=restitution)
     payload.run(0.5)
@@ -198,17 +195,6 @@ def test_a_payload_falls_out_of_the_bag_when_it_is_dropped_and_can_be_thrown_aga
     run(world, 0.35)
     assert [event.kind for event in world.take_events()] == ["taken"]
     assert world.data.xpos[ball_of(world).body] == pytest.approx(lay, abs=0.01)
-
-
-def test_a_flight_whose_payload_missed_flies_on_and_catches_the_next_one() -> None:
-    overrides = ("world.catch_at_m=[0.2, 0]", "mission.repeat=2", "world.throws=2", "world.net.on=true", FIRST_MISSED)
-    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=(*TO_AND_FRO, *overrides)))
-    result, payload = flight.run(), flight.plant.scene.payload
-    assert result.outputs[-1].outcome is Outcome.COMPLETED
-    assert (payload.throws, payload.catches, payload.missed, payload.caught_t_s) == (2, 1, True, None)
-    # The impact, 4 N m give or take 1, overloads the sensor (4 N m) or does not; before and after it nothing may.
-    ids = [event.id for output in result.outputs for event in output.events]
-    assert ids in (["takeoff", *overload, "catch", "touchdown"] for overload in ([], ["force_overload"]))
 
 
 def test_two_payloads_lie_in_the_bag() -> None:
