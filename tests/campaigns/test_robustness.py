@@ -66,20 +66,12 @@ def test_a_file_of_cases_takes_any_name_of_a_mission_and_of_a_vehicle(tmp_path: 
     assert read_cases(tmp_path / "cases.yaml") == cases
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "why"),
-    [
-        ("payload_kg: 0.38", "payload: 0.38", r"cases.yaml:\d+:7: cases\[0\].world.payload"),
-        ("outcome: completed", "outcome: fine", r"cases.yaml:\d+:\d+: cases\[0\].kept.outcome"),
-        ("seed: 12", "seed: twelve", r"cases.yaml:\d+:13: cases\[0\].world.seed"),
-    ],
-)
-def test_a_mistake_in_a_file_of_cases_is_reported_with_its_place(tmp_path: Path, old: str, new: str, why: str) -> None:
+def test_a_mistake_in_a_file_of_cases_is_reported_with_its_place(tmp_path: Path) -> None:
     path = tmp_path / "cases.yaml"
     cases = Cases(mission="a.yaml", controller="adaptive", preset="paper", cases=as_cases([row(0, 0.04)]))
     write_cases(cases, path, "")
-    path.write_text(path.read_text().replace(old, new))
-    with pytest.raises(ConfigError, match=why):
+    path.write_text(path.read_text().replace("payload_kg: 0.38", "payload: 0.38"))
+    with pytest.raises(ConfigError, match=r"cases.yaml:\d+:7: cases\[0\].world.payload"):
         read_cases(path)
 
 

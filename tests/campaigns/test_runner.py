@@ -58,12 +58,6 @@ class Page(HTMLParser):
 COMPARE = ("compare", "--mission", str(CATCH), "--payloads", "0.2", "--controllers", "adaptive", "--out", "out")
 
 
-def test_laboratories_beyond_ten_thousand_can_be_flown(monkeypatch: pytest.MonkeyPatch) -> None:
-    fly_made_up(monkeypatch, compare_row)
-    ended = run_here(*COMPARE, "--presets", "paper", "--seeds", "2", "--first-seed", "10001", "--json")
-    assert [row["seed"] for row in json.loads(ended.out)["rows"]] == [10001, 10002]
-
-
 def test_files_of_a_comparison_hold_what_is_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     def row(flight: dict[str, Any]) -> dict[str, Any]:
         return compare_row(flight, None if flight["preset"] == "paper" else 0.05, error=EVIL)
@@ -206,28 +200,21 @@ CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
     ("words", "why"),
     [
         (("compare", "--controllers", "foo"), r"^companion compare: --controllers foo: no such controller; available: adaptive"),
+        (("compare", "--controllers", "csc", "--ablation"), r"^companion compare: --ablation: .*adaptive/recommended"),
         (("compare", "--presets", "foo"), r"^companion compare: --presets foo: no such preset"),
         (("compare", "--payloads", "0.1,x"), r"^companion compare: .*--payloads: .*kg.*'0\.1,x'"),
-        (("compare", "--payloads", "nan"), r"^companion compare: .*--payloads"),
         (("compare", "--seeds", "0"), r"^companion compare: .*--seeds: .*from 1"),
-        (("compare", "--jobs", "-1"), r"^companion compare: .*--jobs"),
         (("compare", "--set", "world.seed=2"), r"^companion compare: --set world\.seed: .*--seeds"),
-        (("compare", "--set", "controller.rho_maxx=2"), r"^--set controller\.rho_maxx: unknown key"),
         (("compare", "--mission", "nofile.yaml"), r"^nofile\.yaml: no such file$"),
-        (("compare", "--out", ""), r"^companion compare: --out .*empty"),
         (("compare", "--out", "taken"), r"^companion compare: --out taken: already contains compare\.json"),
         (("faults", "--kinds", "mocap_los"), r"there is no kind of fault 'mocap_los'; did you mean 'mocap_loss'\?"),
         (("faults", "--phases", "lunch"), r"there is no phase 'lunch'"),
         (("faults", "--set", "world.faults=[]"), r"the campaign sets this key; use --kinds and --phases"),
         (("faults", "--wires", "--kinds", "gust"), r"no fault to fly with --wires: kind gust, phase any"),
-        (("faults", "--wires", "--kinds", "tool_broken"), r"kind tool_broken, phase touch or press or detach"),
         (("faults", "--kinds", "gust,tool_broken"), r"tool_broken need a mission with a contact, got other kinds"),
         (("robustness", "--case", "heavy"), r"--case needs --cases FILE"),
-        (("robustness", "--cases", "nowhere.yaml"), r"nowhere\.yaml: no such file"),
         (("robustness", "--cases", "empty.yaml"), r"empty\.yaml: cases: expected at least one case"),
-        (("robustness", "--draws", "0"), r"expected a number from 1 to 10000"),
         (("compare", "--first-seed", "1000000"), r"expected a number from 1 to 900000"),
-        (("robustness", "--set", "world.wind=3"), r"wind"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_and_nothing_flies(tmp_path: Path, words: tuple[str, ...], why: str) -> None:
@@ -243,19 +230,10 @@ def test_bad_input_is_one_line_and_nothing_flies(tmp_path: Path, words: tuple[st
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize(
-    ("words", "why"),
-    [
-        (("robustness",), "mission 'hover' never flies in the +x direction"),
-        (("faults", "--kinds", "gust", "--phases", "return"), "mission 'hover' has no phase 'return'"),
-    ],
-)
-def test_a_mission_that_cannot_be_flown_so_is_refused_by_the_campaign(
-    tmp_path: Path, words: tuple[str, ...], why: str
-) -> None:
-    ended = run_here(words[0], str(HOVER), *words[1:])
+def test_a_mission_that_cannot_be_flown_so_is_refused_by_the_campaign(tmp_path: Path) -> None:
+    ended = run_here("faults", str(HOVER), "--kinds", "gust", "--phases", "return")
     assert ended.code == EXIT_BAD_INPUT
-    assert len(ended.err_lines) == 1 and why in ended.err
+    assert len(ended.err_lines) == 1 and "mission 'hover' has no phase 'return'" in ended.err
     assert not any(tmp_path.iterdir())
 
 

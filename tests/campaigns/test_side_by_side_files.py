@@ -18,12 +18,6 @@ from tests.analysis.synthetic_flight import LANDED_S, record_flight
 from tests.campaigns.test_side_by_side import IN_WORLD, configured
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures without a stroke: for tests that are about files and figures."""
-    monkeypatch.setattr(plot_style, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
-
-
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three flights as the recorder writes them, in folders of their own: a whole one with its report, the same with other gains,
@@ -117,16 +111,12 @@ def test_json_is_printed_alone_and_nothing_is_written(flights: Path, capsys: pyt
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ((WHOLE, "nofile.mcap"), r"nofile\.mcap: cannot be read: No such file or directory"),
         (("flights/whole/summary.json", WHOLE), r"flights/whole/summary\.json: is not an MCAP file; .*"),
         ((WHOLE, "damaged.mcap"), r"damaged\.mcap: damaged: .*"),
-        ((WHOLE, "flights"), r"flights: cannot be read: Is a directory"),
         ((WHOLE,) * 7, r"companion report: 7 logs: expected at most 6: .*"),
         ((WHOLE, SHORT, "--align", "catch"), rf"{SHORT}: --align catch: there is no catch in this flight"),
         ((WHOLE, "--align", "catch"), r"companion report: --align: expected two or more logs, got one"),
-        ((WHOLE, GAINS, "--out", ""), r"companion report: --out: expected the name of a folder, got an empty one"),
         ((WHOLE, GAINS, "--out", WHOLE), r"companion report: flights/whole/flight\.mcap: cannot be written: .*--out"),
-        ((WHOLE, "--out", WHOLE), r"companion report: flights/whole/flight\.mcap: cannot be written: .*--out"),
     ],
 )  # fmt: skip
 @pytest.mark.usefixtures("undrawn")

@@ -134,17 +134,6 @@ def of_another_size(path: Path, card: PolicyCard) -> None:
     written(path, PolicyCard.model_validate(card.model_dump() | more))
 
 
-def with_another_input(path: Path, card: PolicyCard) -> None:
-    written(path, card)
-    model = onnx.load(path)
-    model.graph.input[0].type.tensor_type.shape.dim[1].dim_value = 7
-    del model.graph.node[:]
-    model.graph.node.append(helper.make_node("Slice", ["observation", "zeros", "ends"], ["action"]))
-    for name, value in (("zeros", [0, 0]), ("ends", [1, 5])):
-        model.graph.initializer.append(helper.make_tensor(name, TensorProto.INT64, [2], value))
-    onnx.save(model, path)
-
-
 def without_a_card(path: Path, card: PolicyCard) -> None:
     written(path, card)
     model = onnx.load(path)
@@ -156,17 +145,12 @@ REFUSED: dict[str, tuple[Callable[[Path, PolicyCard], object], str]] = {
     "not a number": (not_a_number, "returns [nan, nan, nan, nan, nan], which is not finite"),
     "slow": (slow, " ms for an action (limit 2.5 ms, half a tick)"),
     "unknown observation": (of_another_size, "its observations are not those of this companion and vehicle: wind"),
-    "another input": (with_another_input, "expected an input of 1 x 32 float32, found [1, 7] tensor(float)"),
     "text": (lambda path, card: path.write_text("hello"), "expected a policy in an ONNX file, found none: "),
     "no card": (without_a_card, "its metadata have no key 'companion'"),
     "absent": (lambda path, card: None, "cannot be read: No such file or directory"),
     "another vehicle": (
         lambda path, card: written(path, card.model_copy(update={"mass_kg": 9.0})),
         "was trained for the vehicle 'tarot650-2r' of 9 kg, but this one is 'tarot650-2r' of ",
-    ),
-    "another number of scales": (
-        lambda path, card: written(path, card.model_copy(update={"action_scale": (1.0,)})),
-        "metadata 'companion': action_scale: expected 5 values, got 1",
     ),
 }
 
