@@ -48,6 +48,19 @@ def run(world: OneMachine, time_s: float, *, drag: bool = True) -> None:
         world.fly((0.0,) * machine.rotor_count, (0.0,) * len(machine.layout.joint_q), False, drag=drag)
 
 
+def act(world: OneMachine) -> None:
+    """Let the only effect of the machine act once, on the state as it is."""
+    (effect,), machine = world.machine.effects, world.machine
+    effect.apply(machine.rotor_thrust_n, machine.q, machine.v)
+    world.loads.write()
+
+
+def load(world: OneMachine, body: str) -> list[float]:
+    """Return the force and torque that effects put on a body."""
+    values: list[float] = world.data.xfrc_applied[world.model.body(body).id].tolist()
+    return values
+
+
 def plant_of(config: SitlConfig, commands: Vec4 = (0.0, 0.0, 0.0, 0.0), *, between_steps: bool = False) -> Plant:
     """Return the plant of this world at the start of its mission."""
     start = config.mission.start

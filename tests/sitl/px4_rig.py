@@ -115,9 +115,6 @@ class Rig:
     def arm(self) -> Result:
         return self.command(Command.COMPONENT_ARM_DISARM, 1.0)
 
-    def disarm(self, magic: float = 0.0) -> Result:
-        return self.command(Command.COMPONENT_ARM_DISARM, 0.0, magic)
-
     def mode(self, main: int, sub: int = 0) -> Result:
         return self.command(Command.DO_SET_MODE, 1.0, float(main), float(sub))
 

@@ -141,14 +141,3 @@ def test_a_link_that_slows_down_in_flight_delivers_nothing_twice(flight: FastFli
         heard.append(state.boot_s)
     ticks = [round(boot_s / TICK_PERIOD_S) for boot_s in heard if boot_s is not None]
     assert ticks == [*range(20), *[19] * 10, *range(20, 30), *range(40, 60)]
-
-
-def test_over_a_dead_link_nothing_arrives_and_the_last_state_stays(flight: FastFlight, link: FastLink) -> None:
-    last = link.receive(*at_rest(0.0))
-    flight.faults.active["link_loss"] = Fault(kind="link_loss", t_s=0.0)
-    flight.plant.scene.t_s = 1.0
-    link.send(lambda: pytest.fail("it arrived"))
-    link.deliver_due()
-    assert link.receive(*at_rest(1.0)) == last == at_rest(0.0)
-    flight.faults.active.clear()
-    assert link.receive(*at_rest(1.0)) == at_rest(1.0)

@@ -18,7 +18,7 @@ from companion.sitl_config.world import World
 from sitl.autopilot.mavlink import MavlinkServer, Ports
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.types import Battery
-from sitl.px4.backend import STUB_ONLY_FAULTS, refuse_stub_only_settings
+from sitl.px4.backend import refuse_stub_only_settings
 from sitl.px4.control_link import ControlLink, same
 from sitl.px4.hil_link import Px4Error
 from sitl.px4.parameters import parameters, rotor_geometry
@@ -100,13 +100,6 @@ def test_the_geometry_is_that_of_the_world_and_that_of_a_hexacopter_that_of_px4s
     assert (geometry["CA_ROTOR5_PX"], geometry["CA_ROTOR5_PY"]) == pytest.approx((-0.433, -0.25), abs=1e-3)
     assert [geometry[f"PWM_MAIN_FUNC{i + 1}"] for i in range(6)] == [101, 102, 103, 104, 105, 106]
     assert [geometry[f"CA_ROTOR{i}_KM"] for i in range(6)] == [-0.025, 0.025, -0.025, 0.025, 0.025, -0.025]
-
-
-@pytest.mark.parametrize("kind", list(STUB_ONLY_FAULTS))
-def test_a_fault_that_needs_the_stub_is_refused_in_one_line(kind: str) -> None:
-    world = World(faults=(Fault.model_validate({"kind": kind, "t_s": 1.0}),))
-    with pytest.raises(Px4Error, match=f"world.faults: {kind} .* which only the stub can simulate; run with --sitl"):
-        refuse_stub_only_settings(world)
 
 
 def test_every_other_fault_is_flown() -> None:

@@ -112,14 +112,6 @@ async def test_a_px4_that_boots_is_not_waited_for_and_one_that_stops_answering_i
             assert link.unanswered == 3, "patience, three times, is the deadline"
 
 
-async def test_one_sample_without_an_answer_does_not_end_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(px4_link, "ANSWER_PATIENCE_S", 0.5)
-    async with opened() as link:
-        with await peer_of(link, lambda m: None if m.time_usec == px4_link.clock_us(1.0) else [0.5] * 4):
-            await step(link, range(await boot(link), 500))
-            assert link.unanswered == 1
-
-
 async def test_as_many_controls_are_read_as_there_are_rotors() -> None:
     controls = [0.1 * number for number in range(1, 9)]
     async with opened(rotors=8) as link:

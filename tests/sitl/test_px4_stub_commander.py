@@ -52,14 +52,11 @@ def flying(state: NavState, **overrides: int) -> Commander:
     [
         (NavState.LOITER, GOOD, None),
         (NavState.LOITER, replace(GOOD, origin_set=False), "No valid global position estimate"),
-        (NavState.LOITER, replace(GOOD, attitude_valid=False), "No valid attitude estimate"),
         (NavState.TAKEOFF, replace(GOOD, origin_set=False), None),
         (NavState.TAKEOFF, BLIND, "No valid altitude estimate"),
         (NavState.LAND, GOOD, "Mode not suitable for arming"),
-        (NavState.RTL, GOOD, "Mode not suitable for arming"),
         (NavState.MISSION, GOOD, "No valid mission available"),
         (NavState.POSCTL, GOOD, "No manual control input"),
-        (NavState.STABILIZED, GOOD, "No manual control input"),
         (NavState.OFFBOARD, GOOD, None),
         (NavState.OFFBOARD, BLIND, None),
         (NavState.OFFBOARD, replace(BLIND, attitude_valid=False), "No valid attitude estimate"),
@@ -67,7 +64,6 @@ def flying(state: NavState, **overrides: int) -> Commander:
         (NavState.OFFBOARD, replace(GOOD, setpoint_age_s=0.51), "No offboard signal"),
         (NavState.OFFBOARD, replace(GOOD, setpoint_kind=OffboardKind.POSITION), None),
         (NavState.OFFBOARD, replace(BLIND, setpoint_kind=OffboardKind.POSITION), "No offboard signal"),
-        (NavState.OFFBOARD, replace(BLIND, setpoint_kind=OffboardKind.VELOCITY), "No offboard signal"),
     ],
 )
 def test_arming_rules(state: NavState, health: Health, reason: str | None) -> None:
@@ -88,10 +84,8 @@ def test_arming_rules(state: NavState, health: Health, reason: str | None) -> No
     ("health", "magic", "result", "armed"),
     [
         (FLYING, 0.0, Result.TEMPORARILY_REJECTED, True),
-        (FLYING, 21195.0, Result.TEMPORARILY_REJECTED, True),
         (FLYING, float(FORCE_MAGIC), Result.ACCEPTED, False),
         (replace(FLYING, maybe_landed=True), 0.0, Result.ACCEPTED, False),
-        (GOOD, 0.0, Result.ACCEPTED, False),
         (GOOD, math.nan, Result.ACCEPTED, False),
     ],
 )
@@ -105,10 +99,8 @@ def test_disarming_in_the_air_needs_force(health: Health, magic: float, result: 
     ("command", "params", "result"),
     [
         (Command.COMPONENT_ARM_DISARM, (2.0,), Result.UNSUPPORTED),
-        (Command.COMPONENT_ARM_DISARM, (math.nan,), Result.UNSUPPORTED),
         (Command.DO_SET_MODE, (1.0, math.nan, math.nan), Result.DENIED),
         (Command.DO_SET_MODE, (1.0, 4.0, 7.0), Result.TEMPORARILY_REJECTED),
-        (Command.DO_SET_MODE, (1.0, 9.0, 0.0), Result.TEMPORARILY_REJECTED),
         (31000, (), Result.UNSUPPORTED),
     ],
 )
@@ -123,7 +115,6 @@ def test_a_command_without_a_meaning_changes_nothing(command: int, params: tuple
     [
         (NavState.LAND, FLYING, Result.ACCEPTED),
         (NavState.LAND, replace(FLYING, position_valid=False), Result.TEMPORARILY_REJECTED),
-        (NavState.LOITER, FLYING, Result.ACCEPTED),
         (NavState.LOITER, replace(FLYING, origin_set=False), Result.TEMPORARILY_REJECTED),
         (NavState.OFFBOARD, FLYING, Result.ACCEPTED),
         (NavState.OFFBOARD, replace(FLYING, setpoint_age_s=0.6), Result.TEMPORARILY_REJECTED),
@@ -176,7 +167,6 @@ def test_nothing_leads_out_of_termination() -> None:
         (3, FLYING, NavState.RTL),
         (3, replace(FLYING, origin_set=False), NavState.LAND),
         (5, FLYING, NavState.LOITER),
-        (5, replace(FLYING, origin_set=False), NavState.LAND),
         (0, FLYING, NavState.RTL),
         (6, FLYING, NavState.TERMINATION),
         (4, replace(FLYING, position_valid=False, attitude_valid=False), NavState.TERMINATION),

@@ -59,7 +59,6 @@ def test_an_upward_bias_that_begins_in_flight_fades_as_slowly_as_in_ekf2() -> No
     assert climbs[10000] / climbs[500] == pytest.approx(math.exp(-38.0 * 1.0 / 38.5), rel=0.1)
 
 
-AT_REST_BLIND = 0x81  # attitude, constant position
 AT_REST_FUSED = 0x1AF  # and velocities, relative and vertical position, aiding
 
 
@@ -83,19 +82,3 @@ def test_right_after_vision_begins_the_ratio_is_high_and_settles() -> None:
     assert 0.0 < late.pos_horiz_ratio < 0.1
     assert late.pos_horiz_accuracy < 0.01
     assert math.isnan(late.vel_ratio), "no velocity is fused"
-
-
-def test_without_vision_the_flags_drop_and_the_accuracy_gets_worse() -> None:
-    rig = Rig()
-    rig.run(3.0)
-    good = status(rig)
-    rig.vision = False
-    rig.run(1.0)
-    seen = status(rig)
-    assert seen.flags & (mavlink.ESTIMATOR_POS_VERT_ABS | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL) == 0
-    assert seen.flags & mavlink.ESTIMATOR_POS_HORIZ_REL
-    assert seen.pos_horiz_accuracy > 10.0 * good.pos_horiz_accuracy
-    assert math.isnan(seen.pos_horiz_ratio)
-    rig.run(4.0)
-    assert status(rig).flags == AT_REST_BLIND
-    assert telemetry.local_position_ned(rig.stub) is not None, "PX4 sends it valid or not"

@@ -8,7 +8,6 @@ from functools import cache
 
 import pytest
 
-from companion.model.frames import quat_from_euler_zyx
 from sitl.autopilot.commander import Command, Result
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.origin import Origin
@@ -83,23 +82,6 @@ def test_take_off_hold_land_and_automatic_disarm() -> None:
     assert rig.stub.rotors == (0.0, 0.0, 0.0, 0.0)
     assert rig.height_m == pytest.approx(0.0, abs=1e-6)
     assert rig.texts() == ["Landing detected", "Disarmed by landing"]
-
-
-def test_offboard_needs_a_stream_then_follows_attitude_and_thrust() -> None:
-    rig = ready()
-    rig.mode(6)
-    assert rig.arm() is Result.TEMPORARILY_REJECTED
-    assert rig.stub.arming_problem() == "No offboard signal"
-    assert rig.texts() == ["Arming denied: Resolve system health failures first"]
-    stream(rig, 0.2, AttitudeTarget(LEVEL, 0.0))
-    assert rig.arm() is Result.ACCEPTED
-    stream(rig, 1.0, AttitudeTarget(LEVEL, HOVER * 1.1))
-    assert not rig.stub.landed
-    assert rig.height_m > 0.2
-    wanted = quat_from_euler_zyx(0.1, -0.05, 0.4)
-    stream(rig, 2.0, AttitudeTarget(wanted, HOVER * 1.02))
-    error = 2 * math.acos(min(1.0, abs(sum(a * b for a, b in zip(wanted, rig.plant.attitude, strict=True)))))
-    assert math.degrees(error) < 2.0
 
 
 def test_setpoints_act_after_the_configured_delay() -> None:

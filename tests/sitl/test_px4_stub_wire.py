@@ -102,18 +102,6 @@ async def run_until_handled(rig: Rig, server: MavlinkServer, peer: Peer, message
             await run(rig, server, peer, 0.004)
 
 
-async def test_streams_reach_the_remote_port_unasked_and_in_sequence(rig: Rig, peer: Peer) -> None:
-    async with MavlinkServer(rig.stub, Ports(0, peer.port)) as server:
-        await run(rig, server, peer, 2.0)
-    types = peer.types()
-    assert types["HEARTBEAT"] == 2
-    assert types["ODOMETRY"] == pytest.approx(60, abs=3)
-    assert types["ATTITUDE"] == pytest.approx(200, abs=6)
-    sequence = [message.get_seq() for message in peer.received]
-    assert sequence == [(sequence[0] + i) % 256 for i in range(len(sequence))]
-    assert {(message.get_srcSystem(), message.get_srcComponent()) for message in peer.received} == {(1, 1)}
-
-
 async def test_the_partner_is_the_first_sender_until_px4_restarts_and_links_are_separate(
     rig: Rig, peer: Peer, second: Peer
 ) -> None:

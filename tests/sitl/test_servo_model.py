@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import pytest
 
@@ -78,25 +77,20 @@ def test_position_starts_within_one_turn_and_then_counts_turns() -> None:
     assert get(servo, 132, 4, signed=True) == start
 
 
-@pytest.mark.parametrize(
-    ("setting", "address", "size", "value"),
-    [
-        ({"firmware": 40}, 6, 1, 40),
-        ({"id": 9}, 7, 1, 9),
-        ({"return_delay_us": 100}, 9, 1, 50),
-        ({"drive_mode": 1}, 10, 1, 1),
-        ({"operating_mode": 5}, 11, 1, 5),
-        ({"shadow_id": 7}, 12, 1, 7),
-        ({"current_limit_counts": 600}, 38, 2, 600),
-        ({"position_limit_counts": (10, 4000)}, 48, 4, 4000),
-        ({"position_limit_counts": (10, 4000)}, 52, 4, 10),
-    ],
-)
-def test_a_setting_of_the_world_is_in_its_register(
-    setting: dict[str, Any], address: int, size: int, value: int
-) -> None:
-    world = World.model_validate({"servos": [{}, setting]})
-    assert get(servos_of(VEHICLE, world)[1], address, size) == value
+def test_settings_of_the_world_are_in_their_registers() -> None:
+    settings = {
+        "firmware": 40,
+        "id": 9,
+        "return_delay_us": 100,
+        "drive_mode": 1,
+        "operating_mode": 5,
+        "shadow_id": 7,
+        "current_limit_counts": 600,
+        "position_limit_counts": (10, 4000),
+    }
+    _, servo = servos_of(VEHICLE, World.model_validate({"servos": [{}, settings]}))
+    assert [get(servo, address, 1) for address in (6, 7, 9, 10, 11, 12)] == [40, 9, 50, 1, 5, 7]
+    assert (get(servo, 38, 2), get(servo, 48, 4), get(servo, 52, 4)) == (600, 4000, 10)
 
 
 # --- motor ----------------------------------------------------------------------------------------------------------------

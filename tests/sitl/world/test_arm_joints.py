@@ -41,7 +41,6 @@ from tests.sitl.plants import FixedRotors, OneMachine
 from tests.support import HOVER, LOW_HOVER, SHORT_CATCH, tool_of
 
 Array = NDArray[np.float64]
-LOW = [f"{key}={value}" for key, value in LOW_HOVER.items()]
 NO_FRICTION = WorldConfig(payload_kg=0.0, joint_friction_nm=0.0, joint_damping_nms=0.0)
 
 
@@ -248,13 +247,12 @@ def test_links_too_light_for_their_springs_get_the_inertia_that_the_physics_step
 @pytest.mark.parametrize(
     ("joints", "mission", "changes"),
     [
-        (0, HOVER, LOW),
+        (0, HOVER, [f"{key}={value}" for key, value in LOW_HOVER.items()]),
         (3, SHORT_CATCH, ["vehicle.arm.joints[1].axis=[0, -1, 0.3]", "vehicle.arm.joints[2].axis=[1, 0, 0]"]),
     ],
 )
 def test_a_vehicle_with_any_number_of_joints_and_any_axes_flies(joints: int, mission: Path, changes: list[str]) -> None:
-    config = load_sitl(mission, overrides=[*overrides_with_joints(joints), *changes])
-    result = FastFlight(config).run()
+    result = FastFlight(load_sitl(mission, overrides=[*overrides_with_joints(joints), *changes])).run()
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     warnings = {event.id for output in result.outputs for event in output.events if event.severity is not Severity.INFO}
     assert warnings == set()

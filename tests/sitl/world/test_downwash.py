@@ -15,12 +15,12 @@ from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.downwash import Wakes
-from tests.sitl.plants import OneMachine
+from tests.sitl.plants import OneMachine, act, load
 from tests.support import CATCH
 
 VEHICLE = load_sitl(CATCH).vehicle
 LAYOUT = VEHICLE.airframe.rotor_layout
-OFFSET_M, _, ROTOR_HEIGHT_M = LAYOUT.positions_body_m[2]
+ROTOR_HEIGHT_M = LAYOUT.positions_body_m[2][2]
 RADIUS_M = 0.165
 DISK_M2 = math.pi * RADIUS_M**2
 THRUST_N = 7.5
@@ -59,18 +59,6 @@ def hovering(vehicle: Vehicle, arm_rad: tuple[float, float], height_m: float = 2
     world.data.ctrl[0:4] = FOUR_N
     act(world)
     return world
-
-
-def act(world: OneMachine) -> None:
-    (effect,) = world.machine.effects
-    machine = world.machine
-    effect.apply(machine.rotor_thrust_n, machine.q, machine.v)
-    world.loads.write()
-
-
-def load(world: OneMachine, body: str) -> list[float]:
-    values: list[float] = world.data.xfrc_applied[world.model.body(body).id].tolist()
-    return values
 
 
 def test_a_level_link_below_a_rotor_feels_the_drag_of_its_area() -> None:

@@ -66,7 +66,7 @@ def test_a_tilted_board_feels_gravity_sideways() -> None:
     assert (p, q, r) == pytest.approx((0.0, -1.0, 0.0), abs=1e-12)
 
 
-@pytest.mark.parametrize("hz", [40.0, 80.0, 110.0, 130.0])
+@pytest.mark.parametrize("hz", [40.0, 130.0])
 def test_a_sample_is_the_mean_of_the_vibration_since_the_last_one(hz: float) -> None:
     imu = errors(vibration_m_s2=6.0, gyro_vibration_deg_s=5.0, vibration_hz=hz)
     one: Vec4 = (1.0, 0.0, 0.0, 0.0)  # front right: y < 0, turns the body by -z

@@ -1,4 +1,4 @@
-"""The built machine differs from its vehicle file as the section `machine` says; and every part of it follows another vehicle file."""
+"""The built machine differs from its vehicle file as the section `machine` says."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from companion.sitl_config.effects.machine import Machine
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.model import base_mass_kg
-from tests.sitl.plants import OneMachine, run
+from tests.sitl.plants import OneMachine
 from tests.support import CATCH, tool_of
 
 Array = NDArray[np.float64]
@@ -36,10 +36,6 @@ def built(vehicle: Vehicle = VEHICLE, **errors: Any) -> OneMachine:
     """A world with these errors and no others, arm held at `ARM_RAD`."""
     config = WorldConfig(payload_kg=0.0, machine=Machine(on=True, **{**NOTHING, **errors}))
     return OneMachine(vehicle, config, (0.0, 0.0), 0.0, ARM_RAD)
-
-
-def net_body_m(world: OneMachine) -> Array:
-    return np.array(world.data.site_xpos[world.model.site("net").id] - world.data.qpos[:3])
 
 
 def rotation(rpy_deg: tuple[float, float, float]) -> Array:
@@ -77,68 +73,12 @@ def test_a_hover_with_a_shifted_centre_of_mass_needs_the_torque_of_that_shift_an
     assert min(d.ctrl[:4]) > 0.0
 
 
-def test_the_shoulder_is_moved_and_turned_with_the_whole_arm() -> None:
-    offset_m, rpy_deg = (0.003, -0.002, 0.001), (1.0, -0.8, 0.6)
-    nominal = net_body_m(built())
-    assert net_body_m(built(shoulder_offset_m=offset_m)) - nominal == pytest.approx(offset_m)
-    shoulder = np.array(VEHICLE.arm.shoulder_body_m)
-    turned = rotation(rpy_deg) @ (nominal - shoulder)
-    assert net_body_m(built(shoulder_rpy_deg=rpy_deg)) - shoulder == pytest.approx(turned)
-
-
 def test_the_sensor_frame_of_the_vehicle_file_is_turned_by_zyx_angles() -> None:
     rpy_deg = (10.0, 20.0, 30.0)
     tool = tool_of(VEHICLE).model_copy(update={"sensor_rpy_deg": rpy_deg})
     world = built(VEHICLE.model_copy(update={"tool": tool}))
     link, sensor = (world.data.xmat[world.model.body(name).id].reshape(3, 3) for name in ("link2", "net"))
     assert link.T @ sensor == pytest.approx(rotation(rpy_deg))
-
-
-PHYSICAL = {
-    "airframe": {
-        "mass_kg": 2.4,
-        "inertia_kg_m2": (0.03, 0.035, 0.05),
-        "rotor_arm_m": 0.22,
-        "yaw_torque_per_thrust_m": 0.016,
-        "ground_clearance_m": 0.2,
-    },
-    "arm": {
-        "shoulder_body_m": (0.05, 0.01, -0.08),
-        "link_lengths_m": (0.15, 0.25),
-        "link_masses_kg": (0.1, 0.12),
-        "link_com_m": (0.1, 0.11),
-        "joint_armature_kg_m2": 0.003,
-    },
-    "tool": {"sensor_mass_kg": 0.1, "net_mass_kg": 0.05, "sensor_rpy_deg": (0.0, 0.0, 90.0)},
-    "tether": {"anchor_world_m": (0.5, -1.0, 0.1), "length_m": 2.0, "attachment_body_m": (0.0, 0.0, 0.1)},
-}
-"""Another machine; every value differs from the Tarot's."""
-
-
-def test_another_vehicle_file_is_another_machine_in_all_its_parts() -> None:
-    parts = {part: getattr(VEHICLE, part).model_copy(update=values) for part, values in PHYSICAL.items()}
-    airframe = parts["airframe"].model_copy(update={"thrust_max_n": 40.0})
-    other = VEHICLE.model_copy(update={**parts, "airframe": airframe})
-    world = OneMachine(other, WorldConfig(payload_kg=0.0), (0.0, 0.0), 0.0, ARM_RAD)
-    model, data = world.model, world.data
-    assert world.machine.weight_n == pytest.approx(2.4 * GRAVITY_M_S2)
-    assert world.machine.hover_command == pytest.approx(2.4 * GRAVITY_M_S2 / 40.0)
-    assert data.qpos[2] == 0.2
-    assert sorted(model.body("base").inertia) == [0.03, 0.035, 0.05]
-    assert model.dof_armature[6:8].tolist() == [0.003, 0.003]
-    rotors = np.array([model.site(f"rotor{k}").pos for k in range(4)])
-    assert np.linalg.norm(rotors[:, :2], axis=1) == pytest.approx([0.22] * 4)
-    assert np.abs(model.actuator_gear[:4, 5]) == pytest.approx([0.016] * 4)
-    assert model.tendon_range[0, 1] == 2.0
-    assert world.machine.tether.attachment_world_m == pytest.approx((0.0, 0.0, 0.3))
-    # It stands on its feet at the clearance of its own file.
-    run(world, 0.5)
-    assert world.machine.q[2] == pytest.approx(0.2, abs=0.003)
-    assert not world.machine.crashed
-    # Full command lifts it with the thrust of its own file.
-    for _ in range(500):
-        world.fly((1.0, 1.0, 1.0, 1.0), (0.0, 0.0), False, drag=False)
-    assert float(data.ctrl[:4].sum()) == pytest.approx(40.0)
 
 
 @pytest.mark.parametrize(

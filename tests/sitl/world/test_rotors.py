@@ -64,7 +64,7 @@ def test_rotor_speed_rises_and_falls_with_its_own_time_constant() -> None:
     assert [math.sqrt(n) for n in down] == pytest.approx([top * math.exp(-1.0)] * 4)
 
 
-@pytest.mark.parametrize("height_m", [0.1, 0.33, 1.0, 2.0])
+@pytest.mark.parametrize("height_m", [0.1, 1.0])
 def test_ground_effect_of_four_rotors(height_m: float) -> None:
     r, z, across = 0.165, height_m, 2.0 * ARM_M
     beside = across / math.sqrt(2.0)
@@ -96,7 +96,6 @@ def test_autopilot_assumes_its_own_curve_whether_it_is_the_stub_or_px4() -> None
         signal = motor_signal(command, 0.25)
         assert 0.25 * signal**2 + 0.75 * signal == pytest.approx(command)
         assert motor_signal(command, 0.0) == command
-    assert stub_of(WorldConfig(), VEHICLE.airframe).params.real("THR_MDL_FAC") == 0.0
 
 
 def test_vehicle_hovers_at_the_true_hover_thrust() -> None:

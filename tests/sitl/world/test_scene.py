@@ -98,7 +98,7 @@ def test_two_machines_hover_each_by_its_own_rotors() -> None:
 @pytest.mark.parametrize("number", [0, 1], ids=["first", "second"])
 def test_a_machine_flies_beside_a_distant_one_as_it_does_alone(number: int) -> None:
     mine, away = spec(VEHICLE, LOADED, 0.0), spec(OTHER, LOADED.model_copy(update={"seed": 4}), 15.0)
-    (alone,) = fly([mine], 4.0)
-    both = fly([away, mine] if number else [mine, away], 4.0)[number]
+    (alone,) = fly([mine], 2.5)
+    both = fly([away, mine] if number else [mine, away], 2.5)[number]
     apart = list(map(difference, alone, both))
     assert max(apart) < AGREE

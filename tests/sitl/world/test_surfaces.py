@@ -80,7 +80,7 @@ def test_a_tip_yields_in_addition_to_the_surface(kind: str, stiffness_n_m: float
     assert depth_m == pytest.approx(5.0 / 1000.0 + 5.0 / stiffness_n_m, rel=0.05)
 
 
-@pytest.mark.parametrize(("stiffness_n_m", "damping_ratio"), [(1e3, 0.0), (1e6, 0.0), (1e4, 0.3)])
+@pytest.mark.parametrize(("stiffness_n_m", "damping_ratio"), [(1e3, 0.0), (1e6, 0.0)])
 def test_an_impact_adds_no_energy(stiffness_n_m: float, damping_ratio: float) -> None:
     world = in_front(0.01, stiffness_n_m=stiffness_n_m, damping_ratio=damping_ratio)
     energy_j = []
@@ -93,16 +93,6 @@ def test_an_impact_adds_no_energy(stiffness_n_m: float, damping_ratio: float) ->
     assert touch(world).force_max_n > 2.0
     assert max(energy_j) <= energy_j[0] * (1.0 + 1e-3)
     assert energy_j[-1] < energy_j[0]
-
-
-def test_the_soft_ball_of_the_rod_makes_the_touch_of_a_hard_wall_a_third_as_hard() -> None:
-    hardest_n = []
-    for vehicle in (ROD, SHIPPED):
-        world = in_front(0.002, vehicle, stiffness_n_m=1e5)
-        world.data.qvel[0] = 0.05
-        run(world, 0.6, drag=False)
-        hardest_n.append(touch(world).force_max_n)
-    assert 3.0 < hardest_n[1] < hardest_n[0] / 3.0
 
 
 @pytest.mark.parametrize("stiffness_n_m", [1e3, 1e5])

@@ -12,7 +12,7 @@ from companion.sitl_config.effects.tether_line import TetherLine as TetherLineCo
 from companion.sitl_config.loader import load_sitl
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.tether_line import Hanging, hanging
-from tests.sitl.plants import OneMachine
+from tests.sitl.plants import OneMachine, act, load
 from tests.support import CATCH, tether_of
 
 VEHICLE = load_sitl(CATCH).vehicle
@@ -32,7 +32,7 @@ def ends_at_m(pull: Hanging, length_m: float) -> tuple[float, float]:
 
 @pytest.mark.parametrize(
     ("level_m", "height_m", "length_m"),
-    [(1.5, 1.0, 2.4), (1.5, 1.0, 2.0), (2.6, 1.0, 3.0), (1.5, 1.0, 1.9), (2.0, 2.0, 2.9), (2.0, 0.3, 2.1)],
+    [(1.5, 1.0, 2.4), (1.5, 1.0, 1.9), (2.0, 2.0, 2.9), (2.0, 0.3, 2.1)],
 )
 def test_a_line_that_is_pulled_level_follows_the_catenary(level_m: float, height_m: float, length_m: float) -> None:
     pull = hanging(level_m, height_m, length_m, WEIGHT_N_M)
@@ -58,27 +58,15 @@ def with_line(height_m: float, velocity_m_s: tuple[float, float] = (0.0, 0.0), *
     return world
 
 
-def act(world: OneMachine) -> None:
-    (effect,) = world.machine.effects
-    machine = world.machine
-    effect.apply(machine.rotor_thrust_n, machine.q, machine.v)
-    world.loads.write()
-
-
-def load(world: OneMachine) -> list[float]:
-    values: list[float] = world.data.xfrc_applied[world.model.body("base").id].tolist()
-    return values
-
-
 def test_the_vehicle_carries_what_hangs() -> None:
     for height_m in (0.3, 1.0):
         expected = [0.0, 0.0, -0.016 * 9.80665 * height_m, 0.0, 0.0, 0.0]
-        assert load(with_line(height_m, floor_friction=0.0)) == pytest.approx(expected, rel=1e-3, abs=1e-12)
+        assert load(with_line(height_m, floor_friction=0.0), "base") == pytest.approx(expected, rel=1e-3, abs=1e-12)
 
 
 def test_friction_on_the_floor_takes_energy_and_stays_below_that_of_the_dragged_half() -> None:
     for velocity in ((0.5, 0.0), (-0.3, 0.4), (0.0, -1.0)):
-        fx, fy, *_ = load(with_line(1.0, velocity))
+        fx, fy, *_ = load(with_line(1.0, velocity), "base")
         most_n = 0.3 * 0.016 * 9.81 * 0.5 * 2.0
         assert fx * velocity[0] + fy * velocity[1] < 0.0
         assert 0.9 * most_n < math.hypot(fx, fy) < most_n
@@ -90,7 +78,7 @@ def test_a_nearly_straight_line_pulls_towards_the_anchor_without_a_pull_that_cou
     for slack_m in (0.05, 0.0, -0.05):
         world.machine.tether.length_m = math.dist((x, y, z), ANCHOR) + slack_m
         act(world)
-        fx, fy, fz, *_ = load(world)
+        fx, fy, fz, *_ = load(world, "base")
         assert fx * (ANCHOR[1] - y) == pytest.approx(fy * (ANCHOR[0] - x)) and fy < 0.0 and fz < 0.0
         assert math.hypot(fx, fy, fz) < tether_of(VEHICLE).pull_min_n
     assert world.machine.truth().tether_tension_n == 0.0
