@@ -13,6 +13,7 @@ import itertools
 import json
 import math
 import os
+import re
 import select
 import signal
 import socket
@@ -204,6 +205,11 @@ class Sandbox:
                 os.kill(pid, signal.SIGKILL)
 
 
+def hooked(folder: Path) -> dict[str, str]:
+    """An environment in which every Python imports what is in that folder, its `sitecustomize` at the start."""
+    return {"PYTHONPATH": os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))}
+
+
 @contextlib.contextmanager
 def sandbox_in(folder: Path, environment: Mapping[str, str] | None = None) -> Iterator[Sandbox]:
     """A sandbox that is empty of processes afterwards, whatever happens."""
@@ -242,11 +248,17 @@ class Running:
             assert pipe is not None
             pipe.close()
 
-    def wait_for(self, text: str) -> None:
+    def wait_for(self, text: str | re.Pattern[str]) -> None:
         """Until standard output has shown `text`."""
+        pattern = re.compile(re.escape(text)) if isinstance(text, str) else text
         deadline_s = time.monotonic() + DEADLINE_S
-        while text not in self._text("out"):
+        while not pattern.search(self._text("out")):
             assert self._pump(deadline_s), (f"{text!r} did not come", self._text("out"), self._text("err"))
+
+    @property
+    def out(self) -> str:
+        """Standard output up to what the last `wait_for` was for."""
+        return self._text("out")
 
     def signal(self, number: signal.Signals) -> None:
         """To the whole process group, as the terminal's Ctrl-C."""

@@ -1,6 +1,6 @@
-"""The launcher outlives its children and leaves nothing behind: Ctrl-C, a killed launcher, a world that dies.
+"""The launcher outlives its children and leaves nothing behind: Ctrl-C, a killed launcher.
 
-A flight that hangs beside its guardian: tests/flights/test_armed_externally.py.
+A flight that hangs beside its guardian: tests/flights/test_armed_externally.py. A world that dies: test_team.py.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from companion.analysis.log import FlightLog
 from companion.launcher.guardian_process import GuardianProcess
 from companion.launcher.launcher import Launcher
 from companion.launcher.sitl_process import SitlProcess
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_REFUSED
 from companion.model.launcher_messages import (
     AnyMessage,
     GuardianEnded,
@@ -40,8 +40,8 @@ from tests.runtime.test_cores import CORES, affinities
 from tests.support import DEADLINE_S, HOVER, Sandbox, read_summary, sandbox_in, set_options, wait_until
 
 FLY = ("fly", HOVER, "--sitl", "--out", "out", "--set", "mission.phases[1].duration_s=1.0")
-IN_FLIGHT = "  hold\n"
-"""Printed when the vehicle has reached its height."""
+IN_FLIGHT = "  take-off\n"
+"""Printed when the rotors lift the vehicle."""
 PROCESSES = {
     "flight": "companion.flight.main",
     "guardian": "companion.guardian",
@@ -147,8 +147,9 @@ def test_given_up_before_arming(sandbox: Sandbox) -> None:
     assert sorted(os.sched_getaffinity(0)) == CORES
 
 
-def test_asked_to_land_in_flight_and_asked_again(sandbox: Sandbox) -> None:
-    with sandbox.start(*FLY) as running:
+def test_slower_than_real_time_it_lands_when_asked_in_flight_and_asked_again(sandbox: Sandbox) -> None:
+    """MAVSDK lives on the computer's clock, and hears a heartbeat of PX4 every 3.3 s: PX4 is not lost."""
+    with sandbox.start(*FLY, "--speed", "0.3") as running:
         running.wait_for(IN_FLIGHT)
         running.signal(signal.SIGINT)
         running.wait_for("landing commanded")
@@ -158,7 +159,7 @@ def test_asked_to_land_in_flight_and_asked_again(sandbox: Sandbox) -> None:
     assert (ended.code, ended.err) == (EXIT_ABORTED, "")
     summary = read_summary(sandbox.cwd / "out")
     assert summary["outcome"] == "aborted"
-    assert {"takeoff", "operator_land", "touchdown"} <= set(events_of(summary))
+    assert events_of(summary) == ["takeoff", "operator_land", "touchdown"]
     assert_landed(FlightLog.read(sandbox.cwd / "out/flight.mcap"))
 
 
@@ -180,18 +181,6 @@ def test_killed_launcher_leaves_a_flight_that_lands_by_itself(sandbox: Sandbox) 
     assert_landed(log)
     assert (sandbox.cwd / "out/flight.log").read_text(encoding="utf-8") == ""
     assert (sandbox.cwd / "out/sitl.log").read_text(encoding="utf-8") == ""
-
-
-def test_world_that_dies_in_flight_is_named_in_one_line(sandbox: Sandbox) -> None:
-    with sandbox.start(*FLY) as running:
-        running.wait_for("  take-off\n")
-        os.kill(sandbox.pid_of("sitl"), signal.SIGKILL)
-        ended = running.end()
-    sandbox.assert_nobody_left()
-    assert ended.err == "sitl: the simulated world was ended by SIGKILL; see out/sitl.log\n"
-    assert ended.code == EXIT_LOST
-    assert read_summary(sandbox.cwd / "out")["outcome"] == "lost"
-    assert FlightLog.read(sandbox.cwd / "out/flight.mcap").closed
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -16,17 +17,31 @@ from companion.analysis.pair_report import write_pair_report
 from companion.launcher.team import BAR_FILE
 from companion.model.codec import from_jsonable
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
-from tests.support import PREFLIGHT, ROOT, Sandbox, read_summary, set_options
+from tests.support import PREFLIGHT, ROOT, Sandbox, read_summary, run_here, set_options
 
 TEAM = ROOT / "configs/teams/carry.yaml"
 SHORT = {
-    "mission.phases[1].lower_s": 1.5,
-    "mission.phases[2].lift_m": 0.25,
-    "mission.phases[2].lift_s": 2.5,
-    "mission.phases[2].waypoints": [{"position_m": [-0.85, 0.0], "yaw_deg": 85.0}],
+    "mission.limits.speed_max_m_s": 1.2,
+    "mission.limits.acceleration_max_m_s2": 2.0,
+    "mission.limits.jerk_max_m_s3": 15.0,
+    "mission.limits.arm_speed_max_deg_s": 180.0,
+    "mission.limits.arm_acceleration_max_deg_s2": 400.0,
+    "mission.limits.arm_jerk_max_deg_s3": 2000.0,
+    "mission.phases[0].height_m": 0.6,
+    "mission.phases[0].duration_s": 1.3,
+    "mission.phases[1].lower_s": 0.9,
+    "mission.phases[2].lift_m": 0.15,
+    "mission.phases[2].lift_s": 1.8,
+    "mission.phases[2].waypoints": [{"position_m": [-0.9, 0.0], "duration_s": 0.8}],
+    "mission.phases[3].rise_m": 0.1,
+    "mission.phases[3].rise_s": 0.8,
+    "mission.phases[3].apart_m": 0.5,
+    "mission.phases[3].apart_s": 1.8,
+    "mission.phases[4].speed_m_s": 0.6,
 }
-"""There, a turn, and no way back."""
+"""The bar is lifted, moved by 0.1 m and set down. With a turn, and with what happens on the way: tests/sitl/test_pair.py."""
 FAST = set_options(**{PREFLIGHT: 1.0, "vehicle.ground.mqtt": None}, **SHORT)
+ENDS = ("left", "right")
 INTERFACE = "vehicle.devices.mocap.interface=127.0.0.1"
 FLY = ("team", "fly", TEAM, "--sitl", "--world", "ideal", "--speed", "max", "--out", "out", *FAST)
 
@@ -77,31 +92,30 @@ FLY = ("team", "fly", TEAM, "--sitl", "--world", "ideal", "--speed", "max", "--o
     ids=["one body", "hardware", "px4 as a word", "px4", "misspelt", "speed", "alone", "member", "partner", "key"],
 )
 def test_bad_input_is_one_line_and_nothing_is_started(
-    sandbox: Sandbox, arguments: tuple[object, ...], said: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...], said: str
 ) -> None:
-    ended = sandbox.run(*arguments)
+    monkeypatch.chdir(tmp_path)
+    ended = run_here(*arguments)
     assert ended.code == EXIT_BAD_INPUT
     assert len(ended.err_lines) == 1 and said in ended.err_lines[0], ended.err
-    assert not (sandbox.cwd / "out").exists()
-    sandbox.assert_nobody_left()
+    assert not list(tmp_path.iterdir())
 
 
-def test_on_the_vehicle_each_member_flies_its_own_end(sandbox: Sandbox) -> None:
+def test_on_the_vehicle_a_member_flies_its_own_end(sandbox: Sandbox) -> None:
     """Nothing answers there: the flight is refused, with the member's configuration in its folder."""
     (sandbox.cwd / "team.key").write_bytes(bytes(range(32)))
-    for end, number in (("left", 1), ("right", 2)):
-        here = {"server": "127.0.0.1", "interface": "127.0.0.1", "transport": "unicast", "command_port": 9}
-        link = {"vehicle.devices.team.partner": "127.0.0.1", "vehicle.devices.team.key_file": "team.key"}
-        options = set_options(**{f"vehicle.devices.mocap.{key}": value for key, value in here.items()}, **link)
-        ended = sandbox.run("fly", TEAM, "--member", end, "--out", end, *options)
-        assert ended.code != EXIT_BAD_INPUT, ended
-        config = json.loads((sandbox.cwd / end / "config.json").read_text(encoding="utf-8"))
-        assert config["vehicle"]["devices"]["mocap"]["rigid_body_id"] == number
-        assert [phase["end"] for phase in config["mission"]["phases"] if phase["type"] == "grip"] == [end]
+    here = {"server": "127.0.0.1", "interface": "127.0.0.1", "transport": "unicast", "command_port": 9}
+    link = {"vehicle.devices.team.partner": "127.0.0.1", "vehicle.devices.team.key_file": "team.key"}
+    options = set_options(**{f"vehicle.devices.mocap.{key}": value for key, value in here.items()}, **link)
+    ended = sandbox.run("fly", TEAM, "--member", "right", "--out", "out", *options)
+    assert ended.code != EXIT_BAD_INPUT, ended
+    config = json.loads((sandbox.cwd / "out/config.json").read_text(encoding="utf-8"))
+    assert config["vehicle"]["devices"]["mocap"]["rigid_body_id"] == 2
+    assert [phase["end"] for phase in config["mission"]["phases"] if phase["type"] == "grip"] == ["right"]
 
 
-def test_a_check_of_the_files_starts_nothing(sandbox: Sandbox) -> None:
-    ended = sandbox.run("team", "check", TEAM)
+def test_the_files_are_checked_without_a_flight() -> None:
+    ended = run_here("team", "check", TEAM)
     assert (ended.code, ended.err) == (EXIT_OK, "")
     assert "both members can fly mission 'carry' together" in ended.out
 
@@ -123,7 +137,7 @@ def test_a_team_carries_its_bar_over_wires(sandbox: Sandbox) -> None:
     assert 0.0 < team["internal_force_rms_n"] < 10.0
     assert 0.3 < team["share"] < 0.7
     assert team["let_go"] < 0.1
-    for end in ("left", "right"):
+    for end in ENDS:
         for name in ("flight.mcap", "summary.json", "flight.log", "guardian.log"):
             assert (sandbox.cwd / "out" / end / name).exists()
     assert (sandbox.cwd / "out/team.key").stat().st_mode & 0o077 == 0
@@ -146,7 +160,7 @@ def assert_the_report_shows_both(out: Path, summary: dict[str, Any]) -> None:
 def summary_in(out: Path) -> dict[str, Any]:
     """The summary of both, and of each in it as it stands in the member's folder."""
     summary: dict[str, Any] = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-    assert summary["members"] == {end: read_summary(out / end) for end in ("left", "right")}
+    assert summary["members"] == {end: read_summary(out / end) for end in ENDS}
     return summary
 
 
@@ -154,10 +168,14 @@ def flight_of(out: Path, end: str) -> int:
     return int((out / end / "flight.pid").read_text())
 
 
-def test_a_killed_flight_process_lands_both(sandbox: Sandbox) -> None:
+def test_a_killed_flight_process_is_landed_by_its_guardian_and_the_other_one_by_ctrl_c(sandbox: Sandbox) -> None:
+    """The other one hears the guardian until it ends. Killed while they carry, it lands both: tests/sitl/test_pair.py."""
     with sandbox.start(*FLY, "--no-report") as running:
-        running.wait_for("carry the bar\n")
+        running.wait_for("take-off\n")
         os.kill(flight_of(sandbox.cwd / "out", "right"), signal.SIGKILL)
+        running.wait_for("nothing from the other vehicle")
+        assert "on the ground and disarmed" in running.out
+        running.signal(signal.SIGINT)
         ended = running.end()
     sandbox.assert_nobody_left()
     summary = summary_in(sandbox.cwd / "out")
@@ -167,17 +185,6 @@ def test_a_killed_flight_process_lands_both(sandbox: Sandbox) -> None:
     }
     assert ended.code == EXIT_ABORTED
     assert "right: flight: the flight process was ended by SIGKILL; the guardian landed the vehicle" in ended.err
-
-
-def test_ctrl_c_lands_both(sandbox: Sandbox) -> None:
-    with sandbox.start(*FLY, "--no-report") as running:
-        running.wait_for("take-off\n")
-        running.signal(signal.SIGINT)
-        ended = running.end()
-    sandbox.assert_nobody_left()
-    assert ended.code == EXIT_ABORTED
-    summary = summary_in(sandbox.cwd / "out")
-    assert {member["outcome"] for member in summary["members"].values()} == {"aborted"}
 
 
 def test_a_member_that_is_refused_keeps_the_other_on_the_ground(sandbox: Sandbox) -> None:
@@ -192,12 +199,19 @@ def test_a_member_that_is_refused_keeps_the_other_on_the_ground(sandbox: Sandbox
     assert not {"armed", "takeoff"} & {event["id"] for event in members["left"]["events"]}
 
 
-def test_without_its_world_a_team_is_lost_and_nothing_is_left(sandbox: Sandbox) -> None:
+def test_ctrl_c_lands_both_and_without_its_world_a_team_is_lost_and_nothing_is_left(sandbox: Sandbox) -> None:
+    """What a landing by Ctrl-C ends with: test_launcher.py."""
     with sandbox.start(*FLY, "--no-report") as running:
         running.wait_for("take-off\n")
+        running.signal(signal.SIGINT)
+        for end in ENDS:
+            running.wait_for(re.compile(rf"^{end} .* landing commanded$", re.MULTILINE))
         os.kill(sandbox.pid_of("sitl"), signal.SIGKILL)
         ended = running.end()
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_LOST
-    for end in ("left", "right"):
-        assert f"{end}: sitl: the simulated world was ended by SIGKILL" in ended.err
+    lines = [f"{end}: sitl: the simulated world was ended by SIGKILL; see out/left/sitl.log" for end in ENDS]
+    assert ended.err_lines == lines
+    assert summary_in(sandbox.cwd / "out")["outcome"] == "lost"
+    for end in ENDS:
+        assert FlightLog.read(sandbox.cwd / "out" / end / "flight.mcap").closed
