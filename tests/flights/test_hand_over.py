@@ -1,68 +1,54 @@
-"""An error of our own in mid-air: the flight process hands the vehicle to PX4 and goes on feeding it motion capture."""
+"""An error of our own in mid-air, without a guardian: the flight process hands the vehicle to PX4 and still feeds it motion capture."""
 
 from __future__ import annotations
 
-import asyncio
 import os
-import socket
-import subprocess
-import sys
+import signal
 from pathlib import Path
 
-from companion.config.loader import FlightConfig, load_flight
-from companion.core.flight_core import FlightCore
-from companion.flight import control_loop
-from companion.flight import main as app
-from companion.launcher.launcher import replace_device_settings
-from companion.model.outputs import Outputs
-from companion.model.types import Inputs, Outcome
-from tests.support import DEADLINE_S, HOVER, LOW_HOVER, PATIENT, World, sandbox_in, set_options
-
-BREAKS_AFTER_S = 2.5
-
-
-class BreakingCore(FlightCore):
-    """The real core, until it meets a bug at height."""
-
-    def step(self, inputs: Inputs) -> Outputs:
-        outputs = super().step(inputs)
-        if outputs.mission_t_s > BREAKS_AFTER_S:
-            raise ZeroDivisionError("a bug")
-        return outputs
-
-
-def fly_with_a_bug() -> None:
-    """The flight process: configuration from stdin, folder and socket as arguments, the outcome to stdout."""
-    control_loop.FlightCore = BreakingCore  # type: ignore[attr-defined]
-    config = FlightConfig.model_validate_json(sys.stdin.read())
-    with socket.socket(fileno=int(sys.argv[2])) as channel:
-        print(asyncio.run(app.fly(config, Path(sys.argv[1]), channel)).value)
+from companion.analysis.log import FlightLog
+from companion.model.exit_codes import EXIT_ABORTED
+from tests.support import HOVER, hooked, read_summary, sandbox_in, set_options
 
 
 def test_an_internal_error_in_the_air_lands_by_px4(tmp_path: Path) -> None:
-    """A full disk under flight.log costs the traceback, not the landing. With room on it, it is there: test_guardian.py."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    theirs.setblocking(False)
-    options = [word for word in set_options(**PATIENT, **LOW_HOVER) if word != "--set"]
-    with sandbox_in(tmp_path) as sandbox, World(sandbox, HOVER) as world, ours, theirs, open("/dev/full", "wb") as full:
-        config = replace_device_settings(load_flight(HOVER, overrides=options), world.devices)
-        flown = subprocess.run(
-            [sys.executable, "-m", __name__, str(tmp_path), str(theirs.fileno())],
-            input=config.model_dump_json(),
-            stdout=subprocess.PIPE,
-            stderr=full,
-            pass_fds=(theirs.fileno(),),
-            env={**sandbox.environment, "PYTHONPATH": os.getcwd()},
-            start_new_session=True,
-            text=True,
-            timeout=DEADLINE_S,
-            check=False,
-        )
-        assert flown.stdout.strip() == Outcome.ABORTED.value
-        rest = [message["at_rest"] for message in world.messages if message["type"] == "WorldAtRest"]
-        assert rest[-2:] == [False, True], "it armed, and stands disarmed"
-        assert not world.crashes
+    """A full disk under flight.log costs the traceback, not the landing. With room on it, it is there: test_lockstep.py."""
+    hooks = tmp_path / "hooks"
+    hooks.mkdir()
+    (hooks / "sitecustomize.py").write_text(_BREAKING, encoding="utf-8")
+    hovers = set_options(**{"mission.phases[1].duration_s": 60.0})
+    with sandbox_in(tmp_path / "sandbox", hooked(hooks)) as sandbox:
+        out = sandbox.cwd / "out"
+        with sandbox.start("fly", HOVER, "--sitl", "--out", "out", *hovers) as running:
+            running.wait_for("  take-off\n")
+            os.kill(int((out / "guardian.pid").read_text()), signal.SIGKILL)
+            ended = running.end()
+        sandbox.assert_nobody_left()
+        log, summary = FlightLog.read(out / "flight.mcap"), read_summary(out)
+    assert ended.code == EXIT_ABORTED, ended
+    assert ended.err_lines == ["guardian: the guardian process was ended by SIGKILL; see out/guardian.log"]
+    assert [event["id"] for event in summary["events"]] == ["takeoff", "guardian_lost"], "the core ended in the air"
+    assert summary["outcome"] == "aborted", "PX4 stands disarmed, and the world saw no crash"
+    assert log.closed and log.outputs[-1].mission_t_s > 1.0
 
 
-if __name__ == "__main__":
-    fly_with_a_bug()
+_BREAKING = """
+import sys
+
+if "companion.flight.main" in sys.orig_argv:
+    import companion.core.flight_core
+
+    sys.stderr = open("/dev/full", "w")
+
+    class Breaking(companion.core.flight_core.FlightCore):
+        alone = False
+
+        def step(self, inputs):
+            outputs = super().step(inputs)
+            self.alone = self.alone or any(event.id == "guardian_lost" for event in outputs.events)
+            if self.alone and outputs.mission_t_s > 1.2:
+                raise ZeroDivisionError("a bug")
+            return outputs
+
+    companion.core.flight_core.FlightCore = Breaking
+"""
