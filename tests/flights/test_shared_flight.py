@@ -1,5 +1,6 @@
-"""One flight over wires at which several tests look: a vehicle without force sensor, tether and net, flown by a law of another package,
-whose guardian dies in the air, whose terminal goes away then, and whose first request to disarm is lost.
+"""One flight over wires at which several tests look: a vehicle without force sensor, tether and net, whose poses another program sends
+to PX4, flown by a law of another package, whose guardian dies in the air, whose terminal goes away then, and whose first request to
+disarm is lost.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import pytest
 from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from tests.plugins.installed import write_distribution
-from tests.support import HOVER, ROOT, Ended, Sandbox, read_summary, run_here, sandbox_in, set_options
+from tests.support import HOVER, ROOT, Ended, Sandbox, hooked, read_summary, run_here, sandbox_in, set_options
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,13 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
     write_distribution(site, "lab-lqr", "0.1.0", {"lqr": "lab_lqr:LqrLaw"})
     disarms = folder / "disarms"
     (site / "sitecustomize.py").write_text(_DEAF_ONCE.format(file=str(disarms)), encoding="utf-8")
-    there = {"PYTHONPATH": os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH"))))}
     absent = set_options(**{"vehicle.devices.force": None, "vehicle.tether": None, "vehicle.tool": None})
-    with sandbox_in(folder / "sandbox", there) as sandbox:
-        with sandbox.start("fly", HOVER, "--sitl", "--controller", "lqr", "--out", "out", *absent) as running:
-            running.wait_for("  hold\n")
+    external = ("--set", "vehicle.devices.mocap.type=external")
+    with sandbox_in(folder / "sandbox", hooked(site)) as sandbox:
+        with sandbox.start(
+            "fly", HOVER, "--sitl", "--controller", "lqr", "--out", "out", *absent, *external
+        ) as running:
+            running.wait_for("  take-off\n")
             os.kill(int((sandbox.cwd / "out/guardian.pid").read_text()), signal.SIGKILL)
             running.close_output()
             ended = running.end()
@@ -72,6 +75,13 @@ def test_a_lost_request_to_disarm_is_made_again_and_the_flight_ends_disarmed(flo
     assert read_summary(flown.sandbox.cwd / "out")["outcome"] == "completed"
     status = flown.log.inputs[-1].status
     assert status is not None and not status.armed
+
+
+def test_it_flies_on_poses_that_another_program_sends_to_px4(flown: Flown) -> None:
+    """The simulated world sends them, on a link of its own; the companion has the report of PX4's estimator alone."""
+    assert flown.ended.code == EXIT_OK, flown.ended
+    assert all(inputs.mocap is None for inputs in flown.log.inputs)
+    assert read_summary(flown.sandbox.cwd / "out")["latency_ms"]["mocap_to_setpoint"]["p99"] is None
 
 
 def test_it_flies_without_force_sensor_tether_and_net(flown: Flown) -> None:

@@ -14,54 +14,41 @@ from companion.analysis.contact import rotor_distance_m
 from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_ABORTED
 from companion.model.frames import euler_zyx_from_quat
-from tests.support import HOVER, HOVERS_S, Sandbox, World, read_summary, sandbox_in, set_options
+from tests.support import HOVER, Sandbox, World, read_summary, set_options
 from tests.wires import bridged, plugged, serial_line
 
-LANDS_S = 0.5
-"""From the lost arm to the lost poses: the landing is under way, and above the floor."""
+FLIPS_S, ARM_LOST_S, LATE_S = 3.4, 4.4, 4.9
+"""After arming: every second pose is turned by 180 deg for a second, the arm's servo falls silent in the hover, and during the landing
+frames wait behind Motive's stamp.
+"""
 
 
-def test_a_lost_arm_lands_it_and_another_programs_end_is_found(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """The simulated world sends the poses to PX4 on a link of its own; the companion has the report of PX4's estimator alone. The
-    arm's servo falls silent in the hover, and the other program during the landing.
-    """
-    with sandbox_in(tmp_path_factory.mktemp("external")) as sandbox:
-        faults = [{"kind": "servo_loss", "t_s": HOVERS_S}, {"kind": "mocap_loss", "t_s": HOVERS_S + LANDS_S}]
-        far = [{"point_m": [50.0, 0.0, 1.0], "normal": [-1.0, 0.0, 0.0]}]
-        options = {"vehicle.devices.mocap.type": "external", "world.faults": faults, "world.surfaces": far}
-        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *set_options(**options))
-        sandbox.assert_nobody_left()
-        summary = read_summary(sandbox.cwd / "out")
+def test_a_body_that_flickers_is_flown_through_a_lost_arm_lands_it_and_poses_that_wait_on_the_network_are_noticed(
+    sandbox: Sandbox,
+) -> None:
+    """Frames at 120 Hz start no tick. Poses that another program sends to PX4: test_shared_flight.py."""
+    faults = [
+        {"kind": "mocap_flip", "t_s": FLIPS_S, "duration_s": 0.8},
+        {"kind": "servo_loss", "t_s": ARM_LOST_S},
+        {"kind": "mocap_network", "t_s": LATE_S, "size": 0.15},
+    ]
+    far = [{"point_m": [50.0, 0.0, 1.0], "normal": [-1.0, 0.0, 0.0]}]
+    hovers = {"mission.phases[1].duration_s": 2.0}
+    options = {"world.faults": faults, "world.mocap_rate_hz": 120.0, "world.surfaces": far, **hovers}
+    ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *set_options(**options))
+    sandbox.assert_nobody_left()
+    summary = read_summary(sandbox.cwd / "out")
+    log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
     assert ended.code == EXIT_ABORTED, ended
     assert summary["outcome"] == "aborted"  # and not lost: PX4 landed and is disarmed, whoever noticed the floor first
-    wanted = ["takeoff", "arm_lost", "vision_lost"]
+    wanted = ["takeoff", "mocap_jump", "arm_lost", "mocap_too_late"]
     assert [event["id"] for event in summary["events"] if event["id"] in wanted] == wanted
-    assert summary["latency_ms"]["mocap_to_setpoint"]["p99"] is None
-    distance_m = rotor_distance_m(summary)
-    assert distance_m is not None and 50.0 < distance_m < 51.0
-
-
-def test_a_body_that_flickers_is_flown_through_and_poses_that_wait_on_the_network_land_it(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> None:
-    """Frames at 120 Hz start no tick; every second pose is turned by 180 deg for a second. Then frames wait behind Motive's stamp."""
-    with sandbox_in(tmp_path_factory.mktemp("flickers")) as sandbox:
-        faults = [
-            {"kind": "mocap_flip", "t_s": HOVERS_S, "duration_s": 1.0},
-            {"kind": "mocap_network", "t_s": HOVERS_S + 1.2, "size": 0.15},
-        ]
-        options = {"world.faults": faults, "world.mocap_rate_hz": 120.0}
-        ended = sandbox.run("fly", HOVER, "--sitl", "--out", "out", *set_options(**options))
-        sandbox.assert_nobody_left()
-        summary = read_summary(sandbox.cwd / "out")
-        log = FlightLog.read(sandbox.cwd / "out/flight.mcap")
-    assert ended.code == EXIT_ABORTED, ended
-    wanted = ["mocap_jump", "mocap_too_late"]
-    assert [event["id"] for event in summary["events"] if event["id"].startswith("mocap")][:2] == wanted
     yaws_rad = [euler_zyx_from_quat(i.vehicle.attitude_wxyz)[2] for i in log.inputs if i.vehicle is not None]
     assert max(yaws_rad) - min(yaws_rad) < 0.2, "PX4 got none of the turned poses"
     late_s = [i.mocap.latency_s for i in log.inputs if i.mocap is not None and i.mocap.latency_s is not None]
     assert max(late_s) == pytest.approx(0.155, abs=0.01), "the log has the age at arrival"
+    distance_m = rotor_distance_m(summary)
+    assert distance_m is not None and 50.0 < distance_m < 51.0
 
 
 def test_a_serial_link_to_px4_that_comes_back_in_the_air_is_landed_and_not_lost(sandbox: Sandbox) -> None:
