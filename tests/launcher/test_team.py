@@ -17,6 +17,7 @@ from companion.analysis.pair_report import write_pair_report
 from companion.launcher.team import BAR_FILE
 from companion.model.codec import from_jsonable
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
+from tests.flights.test_px4 import REAL
 from tests.support import PREFLIGHT, ROOT, Sandbox, read_summary, run_here, set_options
 
 TEAM = ROOT / "configs/teams/carry.yaml"
@@ -120,8 +121,9 @@ def test_the_files_are_checked_without_a_flight() -> None:
     assert "both members can fly mission 'carry' together" in ended.out
 
 
-def test_a_team_carries_its_bar_over_wires(sandbox: Sandbox) -> None:
-    ended = sandbox.run(*FLY, "--no-report", "--seed", "1")
+@pytest.mark.parametrize("autopilots", ["--sitl", pytest.param("--sitl=px4", marks=REAL)], ids=["stubs", "px4"])
+def test_a_team_carries_its_bar_over_wires(sandbox: Sandbox, autopilots: str) -> None:
+    ended = sandbox.run(*FLY[:3], autopilots, *FLY[4:], "--no-report", "--seed", "1")
     sandbox.assert_nobody_left()
     assert ended.code == EXIT_OK, ended
     assert "landing commanded" not in ended.out, "the one that is ready first asks nothing of the other"
