@@ -46,6 +46,7 @@ def press(
     wall: dict[str, Any] | None = None,
     *,
     hold_after_s: float | None = None,
+    from_m: float = 0.7,
     approach_m_s: float = 0.06,
     face_m: float | None = None,
     until: Callable[[Outputs], bool] | None = None,
@@ -55,13 +56,14 @@ def press(
     Args:
         wall: keys of the wall that differ from `WALL`.
         hold_after_s: time after the first touch at which the operator commands a hold.
+        from_m: x of where the approach begins.
         approach_m_s: speed of the approach.
         face_m: `face_m` of the approach.
         until: what ends the flight before its landing.
     """
     overrides = [
         *SHORT,
-        "mission.phases[2].to_m=[0.7,0.0,0.7]",
+        f"mission.phases[2].to_m=[{from_m},0.0,0.7]",
         f"world.surfaces={json.dumps([WALL | (wall or {})])}",
         f"mission.phases[3].speed_m_s={approach_m_s}",
         f"mission.phases[3].face_m={json.dumps(face_m)}",
@@ -94,7 +96,7 @@ def force_n(result: FastResult) -> np.ndarray[Any, Any]:
 @pytest.fixture(scope="module")
 def pressed() -> tuple[FastFlight, FastResult]:
     wall = {"tilt_error_deg": [12.0, -6.0], "place_error_m": -0.03, "friction": 0.12}
-    return press(wall, approach_m_s=0.08, face_m=0.15, until=contact_over())
+    return press(wall, from_m=0.74, approach_m_s=0.08, face_m=0.15, until=contact_over())
 
 
 def test_the_force_is_held_on_a_slippery_tilted_wall_that_is_not_where_the_mission_expects_it(
@@ -118,7 +120,7 @@ def test_after_the_contact_nothing_presses_and_the_vehicle_is_back_on_its_plan(
     assert result.outputs[last].contact.mode is ContactMode.RETURN  # type: ignore[union-attr]
     after = result.outputs[last + 1].reference
     assert after is not None and after.push_world_n is None
-    assert after.position_world_m == pytest.approx((0.7, 0.0, 0.7), abs=1e-3)
+    assert after.position_world_m == pytest.approx((0.74, 0.0, 0.7), abs=1e-3)
     assert force_n(result)[last + 1 :].max() == 0.0
 
 
@@ -270,8 +272,12 @@ def test_the_check_refuses_what_cannot_press(changes: dict[str, object], text: s
 def test_a_probe_finds_the_surface_and_writes_its_points(tmp_path: Path) -> None:
     wall = WALL | {"tilt_error_deg": [9.0, -7.0], "place_error_m": 0.03, "friction": 0.15}
     way = ["mission.start.position_m=[0.4,0.0]", "mission.phases[0]={type: takeoff, height_m: 0.7, duration_s: 1.8}"]
-    way += ["mission.phases[2].to_m=[0.6,0.0,0.7]", "mission.phases[4].to_m=[0.5,0.0,0.7]"]
-    grid = [f"mission.phases[3].{key}" for key in ("rows=2", "columns=2", "speed_m_s=0.05")]
+    way += [
+        "mission.phases[1].duration_s=0.1",
+        "mission.phases[2].to_m=[0.62,0.0,0.7]",
+        "mission.phases[4].to_m=[0.5,0.0,0.7]",
+    ]
+    grid = [f"mission.phases[3].{key}" for key in ("rows=2", "columns=2", "spacing_m=0.06", "speed_m_s=0.05")]
     flight = FastFlight(
         load_sitl("probe", world="ideal", overrides=[f"world.surfaces={json.dumps([wall])}", *way, *grid])
     )

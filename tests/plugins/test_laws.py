@@ -80,6 +80,14 @@ def test_a_check_names_it_with_its_distribution() -> None:
     assert out.getvalue().startswith("tarot650-2r, mission 'hover', control law 'lift' (lab-a 1.0)")
 
 
+def assert_refused(capsys: pytest.CaptureFixture[str], reason: str) -> None:
+    """The law is refused by name in one line."""
+    assert main(["check", "hover", "--plan-only", "--controller", "lift"]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.count("\n") == 1
+    assert err.startswith("control law 'lift' (lab-a 1.0): ") and reason in err
+
+
 @pytest.mark.parametrize(
     ("old", "new", "reason"),
     [
@@ -95,12 +103,7 @@ def test_one_that_cannot_be_used_is_refused_by_name_and_does_not_disturb_the_oth
 ) -> None:
     write_law(tmp_path, LAW.replace(old, new))
     with on_path(tmp_path):
-        assert main(["check", "hover", "--plan-only", "--controller", "lift"]) == 2
-        out, err = capsys.readouterr()
-        assert out == ""
-        assert err.count("\n") == 1
-        assert err.startswith("control law 'lift' (lab-a 1.0): ")
-        assert reason in err
+        assert_refused(capsys, reason)
         assert main(["check", "hover", "--plan-only"]) == 0
         with pytest.raises(SystemExit):
             main(["fly", "--help"])
@@ -180,12 +183,7 @@ def test_one_that_fails_its_trial_is_refused_by_name_in_one_line(
 ) -> None:
     write_law(tmp_path, REPLACE + LAW + code)
     with on_path(tmp_path):
-        assert main(["check", "hover", "--plan-only", "--controller", "lift"]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.count("\n") == 1
-    assert err.startswith("control law 'lift' (lab-a 1.0): ")
-    assert reason in err
+        assert_refused(capsys, reason)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ import struct
 import threading
 import time
 import tomllib
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from unittest.mock import Mock
@@ -71,26 +71,27 @@ STRANGER = ("wand", (1.0, 2.0, 3.0, 0.0, 0.0, 0.0))
 QUAD = ("quad", (-1250.0, 500.0, 1000.0, 0.1, 0.2, 0.3))
 
 
-@asynccontextmanager
-async def broadcasting(port: int, *objects: tuple[str, tuple[float, ...]]) -> AsyncIterator[None]:
+@contextmanager
+def broadcasting(port: int, *objects: tuple[str, tuple[float, ...]]) -> Iterator[None]:
     """Broadcast frames as Tracker does, 200 per second, on the loopback interface."""
+    stop = threading.Event()
 
-    async def send() -> None:
+    def send() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
             sender.bind(("127.0.0.1", 0))
-            number = 0
-            while True:
-                number += 1
+            for number in count(1):
                 sender.sendto(datagram(number, *objects), ("127.255.255.255", port))
-                await asyncio.sleep(0.005)
+                if stop.wait(0.005):
+                    return
 
-    sending = asyncio.create_task(send())
+    tracker = threading.Thread(target=send)
+    tracker.start()
     try:
         yield
     finally:
-        sending.cancel()
-        await asyncio.gather(sending, return_exceptions=True)
+        stop.set()
+        tracker.join()
 
 
 def check_pose(pose: MocapPose) -> None:
@@ -109,38 +110,24 @@ async def test_flight_and_guardian_receive_the_same_poses() -> None:
     device = vicon(port)
     poses: list[MocapPose] = []
     client = GuardianMocap(settings_of(device), lambda: 100.0)
-    async with broadcasting(port, STRANGER, QUAD), MocapDriver(device, clock, poses.append) as driver:
-        pose = driver.latest()
-        assert pose is not None and pose is poses[-1] and 0.0 <= clock() - pose.stamp_s < 1.0
-        check_pose(pose)
-        assert driver.server is not None and driver.server.name == "Vicon Tracker, UDP object stream"
-        assert driver.counts().malformed == 0
-        client.keep_connected()
-        seen = client.poses(origin_s=60.0)
-        assert seen and client.tracked_s == 100.0 and 39.0 < seen[-1].stamp_s <= 40.0
-        check_pose(seen[-1])
+    with broadcasting(port, STRANGER, QUAD):
+        async with MocapDriver(device, clock, poses.append) as driver:
+            pose = driver.latest()
+            assert pose is not None and pose is poses[-1] and 0.0 <= clock() - pose.stamp_s < 1.0
+            check_pose(pose)
+            assert driver.server is not None and driver.server.name == "Vicon Tracker, UDP object stream"
+            assert driver.counts().malformed == 0
+            client.keep_connected()
+            seen = client.poses(origin_s=60.0)
+            assert seen and client.tracked_s == 100.0 and 39.0 < seen[-1].stamp_s <= 40.0
+            check_pose(seen[-1])
     client.close()
 
 
 def test_the_example_and_a_system_that_answers_every_call_keep_the_contract() -> None:
-    port, stop = free_udp_port(), threading.Event()
-
-    def send() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            sender.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            sender.bind(("127.0.0.1", 0))
-            for number in count(1):
-                sender.sendto(datagram(number, STRANGER, QUAD), ("127.255.255.255", port))
-                if stop.wait(0.005):
-                    return
-
-    tracker = threading.Thread(target=send)
-    tracker.start()
-    try:
+    port = free_udp_port()
+    with broadcasting(port, STRANGER, QUAD):
         check_mocap(vicon(port), duration_s=0.3)
-    finally:
-        stop.set()
-        tracker.join()
     check_mocap(scripted(), duration_s=0.1)
 
 
@@ -190,9 +177,11 @@ async def test_an_object_that_is_not_tracked_is_reported() -> None:
     port = free_udp_port()
     device = vicon(port)
     driver = MocapDriver(device, flight_clock(), lambda _: None, body_timeout_s=0.3)
-    async with broadcasting(port, ("quad", (0.0,) * 6)):
-        with pytest.raises(DeviceError, match="rigid body 1 was not tracked within"):
-            await driver.__aenter__()
+    with (
+        broadcasting(port, ("quad", (0.0,) * 6)),
+        pytest.raises(DeviceError, match="rigid body 1 was not tracked within"),
+    ):
+        await driver.__aenter__()
 
 
 def test_damaged_datagrams_are_rejected() -> None:

@@ -18,8 +18,6 @@ from tests.safety.faults import EXTERNAL, FAULTS, FOUND, RULE, VEHICLE, Fault, r
 from tests.safety.healthy import START_S, TICK_S, after_a_moment, fed_by_another, flying, healthy, standing, watched
 
 NOMINAL, WARN, HOLD, RETRACT = SafetyAction.NOMINAL, SafetyAction.WARN, SafetyAction.HOLD, SafetyAction.RETRACT
-
-
 LAND, PX4_LANDS, TERMINATE = SafetyAction.LAND, SafetyAction.AUTOPILOT_LAND, SafetyAction.TERMINATE
 
 
@@ -34,11 +32,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "operator_start": (NOMINAL, NOMINAL, 0.015),
     "operator_land": (LAND, LAND, 0.015),
     "operator_abort": (LAND, LAND, 0.015),
-    "killed": (
-        PX4_LANDS,
-        PX4_LANDS,
-        0.015,
-    ),  # nothing is sent after it: what would be, would act when the switch is released
+    "killed": (PX4_LANDS, PX4_LANDS, 0.015),  # whatever is sent after it would act when the switch is released
     "armed_externally": (LAND, PX4_LANDS, 0.000),  # on the ground it is disarmed; in the air nobody else lands it
     "mocap_lost": (PX4_LANDS, PX4_LANDS, 0.220),  # PX4's estimate holds for 4.5 s, the companion has none
     "mocap_invalid": (PX4_LANDS, PX4_LANDS, 0.210),
