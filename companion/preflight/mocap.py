@@ -152,10 +152,13 @@ def _latency(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
     limit_s, worst_s = vehicle.safety.mocap_latency_warn_s, vehicle.safety.mocap_latency_max_s
     wanted = f"{limit_s * 1e3:.0f} ms"
     latency_s = sorted(pose.latency_s for pose in poses if pose.latency_s is not None)
-    if not latency_s:
-        return LATENCY.doubtful(
-            "the server does not report it", wanted, "use cameras that stamp exposure, and NatNet 3.0 to 4.4"
+    fix = "use cameras that stamp exposure, and NatNet 3.0 to 4.4"
+    if vehicle.devices.team is not None and all(pose.exposure_server_s is None for pose in poses):
+        return LATENCY.bad(
+            "the server does not stamp exposures", wanted, f"two vehicles begin together by its clock: {fix}"
         )
+    if not latency_s:
+        return LATENCY.doubtful("the server does not report it", wanted, fix)
     high_s = latency_s[int(0.99 * (len(latency_s) - 1))]
     read = f"{latency_s[len(latency_s) // 2] * 1e3:.1f} ms, {high_s * 1e3:.1f} ms at the 99th percentile"
     fix = "lower Motive's load: fewer markers and bodies, no video, labelled markers off; use a cable, not Wi-Fi"

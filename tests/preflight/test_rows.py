@@ -173,6 +173,9 @@ CASES = {
     "uneven": Case("mocap.jitter", "9", "Wi-Fi", {"mocap": gap(500, 0.09)}, WARN),
     "late frames": Case("mocap.latency", "60.0 ms", "Motive's load", {"mocap": r.mocap(latency_s=0.06)}, WARN),
     "very late frames": Case("mocap.latency", "200.0 ms", "Motive's load", {"mocap": r.mocap(latency_s=0.2)}),
+    "no clock for two": Case(
+        "mocap.latency", "does not stamp", "NatNet", {"mocap": r.mocap(exposure_server_s=None)}, vehicle={"devices.team": {}}
+    ),
     "latency not told": Case("mocap.latency", "does not report", "NatNet", {"mocap": r.mocap(latency_s=None)}, WARN),
     "lost frames": Case("mocap.lost", "20 of 1020", "cable", {"mocap_stream": r.stream(lost=20)}, WARN),
     "many lost frames": Case("mocap.lost", "100 of 1100", "cable", {"mocap_stream": r.stream(lost=100)}),
