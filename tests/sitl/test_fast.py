@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import math
 
 import pytest
@@ -14,7 +15,7 @@ from companion.model.types import Joints, Outcome, PhaseKind, Reference, SafetyA
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.faults.timing import ARMED_SEEN_S
-from tests.support import LOW_HOVER
+from tests.support import LOW_HOVER, ROOT
 
 LOW = tuple(f"{key}={value}" for key, value in LOW_HOVER.items())
 
@@ -93,6 +94,25 @@ def test_a_law_whose_torques_stay_unusable_is_landed_by_px4_with_the_arm_folded(
     fold_deg = flight.config.vehicle.fold_arm_deg
     assert result.inputs[-1].arm is not None
     assert [math.degrees(angle) for angle in result.inputs[-1].arm.angle_rad] == pytest.approx(fold_deg, abs=5.0)
+
+
+def test_a_vehicle_that_px4_lands_with_a_drifting_estimate_is_stopped_when_it_stands() -> None:
+    """Poses freeze after the take-off. The estimate sinks 0.35 m/s too fast, and on the floor it continues at half of its speed; PX4
+    would raise the vehicle again (laboratory 9337 of docs/internals/tune.md).
+    """
+    faults = json.dumps([{"kind": "mocap_freeze", "t_s": 5.8}])
+    overrides = [f"world.faults={faults}", "world.seed=9337", "world.payload_kg=0", "mission.repeat=1"]
+    overrides += ["mission.limits.speed_max_m_s=0.8"]  # as it was flown when this laboratory was found
+    config = load_sitl(ROOT / "configs/missions/circuit.yaml", preset="recommended", overrides=overrides, world="lab")
+    result = FastFlight(config).run(12.8)
+    events = {event.id: event for outputs in result.outputs for event in outputs.events}
+    assert events["mocap_frozen"].action is SafetyAction.AUTOPILOT_LAND
+    landed_s = events["autopilot_landing"].t_s
+    assert landed_s < 12.7
+    floor_m = config.vehicle.airframe.ground_clearance_m
+    heights_m = [s.q[2] for o, s in zip(result.outputs, result.snapshots, strict=True) if o.t_s >= landed_s]
+    assert max(heights_m) < floor_m + 0.02
+    assert result.outputs[-1].attitude is not None and result.outputs[-1].attitude.thrust == 0.0
 
 
 @pytest.mark.parametrize("on", [True, False])

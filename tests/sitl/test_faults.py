@@ -22,7 +22,9 @@ from sitl.campaigns.faults import fly
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from sitl.faults.timing import FaultError, with_fault_times
-from tests.support import CATCH, HOVER, ROOT, SHORT_CATCH
+from tests.support import CATCH, HOVER, SHORT_CATCH
+
+pytestmark = pytest.mark.usefixtures("short_wait")
 
 CONFIG = load_sitl(CATCH, preset="recommended")
 LINE_M_S = 0.74
@@ -211,25 +213,6 @@ def test_a_tether_that_holds_it_brings_it_down() -> None:
     assert good(row), row["problems"]
     assert row["outcome"] == "landed"
     assert {"tether_taut", "tether_snagged"} & set(row["events"])
-
-
-def test_a_vehicle_that_px4_lands_with_a_drifting_estimate_is_stopped_when_it_stands() -> None:
-    """Poses freeze after the take-off. The estimate sinks 0.35 m/s too fast, and on the floor it continues at half of its speed; PX4
-    would raise the vehicle again (laboratory 9337 of docs/internals/tune.md).
-    """
-    faults = json.dumps([{"kind": "mocap_freeze", "t_s": 5.8}])
-    overrides = [f"world.faults={faults}", "world.seed=9337", "world.payload_kg=0", "mission.repeat=1"]
-    overrides += ["mission.limits.speed_max_m_s=0.8"]  # as it was flown when this laboratory was found
-    config = load_sitl(ROOT / "configs/missions/circuit.yaml", preset="recommended", overrides=overrides, world="lab")
-    result = FastFlight(config).run(12.8)
-    events = {event.id: event for outputs in result.outputs for event in outputs.events}
-    assert events["mocap_frozen"].action is SafetyAction.AUTOPILOT_LAND
-    landed_s = events["autopilot_landing"].t_s
-    assert landed_s < 12.7
-    floor_m = config.vehicle.airframe.ground_clearance_m
-    heights_m = [s.q[2] for o, s in zip(result.outputs, result.snapshots, strict=True) if o.t_s >= landed_s]
-    assert max(heights_m) < floor_m + 0.02
-    assert result.outputs[-1].attitude is not None and result.outputs[-1].attitude.thrust == 0.0
 
 
 class Received:

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import math
 
+import pytest
+
 from companion.config.safety import Safety
 from companion.model.types import Outcome, SafetyAction
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from tests.support import SHORT_CATCH
+
+pytestmark = pytest.mark.usefixtures("short_wait")
 
 LIMIT_M = Safety().mocap_inertial_m
 ONLY_VIBRATION = {

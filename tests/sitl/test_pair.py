@@ -22,10 +22,8 @@ Commands = Sequence[Mapping[float, OperatorCommand]]
 
 
 @pytest.fixture(autouse=True)
-def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The wait before take-off is short, and a flight with faults that is ended in the air is not followed to the floor."""
-    monkeypatch.setattr("companion.model.flight_stage.TARE_S", 0.1)
-    monkeypatch.setattr("companion.mission.settled.SETTLED_S", 0.1)
+def _short(short_wait: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight with faults that is ended in the air is not followed to the floor."""
     monkeypatch.setattr("sitl.fast.loop.SETTLE_S", 0.0)
 
 

@@ -26,6 +26,8 @@ from companion.sitl_config.world import Push
 from sitl.fast.loop import FastFlight
 from sitl.faults.timing import ARMED_SEEN_S
 
+pytestmark = pytest.mark.usefixtures("short_wait")
+
 DOWN: Vec3 = (0.0, 0.0, -2.0)
 BACK: Vec3 = (-2.0, 0.0, 0.0)
 LEFT: Vec3 = (0.0, 2.0, 0.0)

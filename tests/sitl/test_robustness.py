@@ -17,6 +17,8 @@ from sitl.campaigns import flights, robustness
 from sitl.campaigns.flights import Flown
 from tests.support import CATCH, HOVER, SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_wait")
+
 CONFIG = load_sitl(CATCH, preset="recommended")
 PLACES = robustness.throws(CONFIG.mission, CONFIG.vehicle)
 DRAWS = [robustness.draw(7, number, PLACES) for number in range(400)]

@@ -14,6 +14,8 @@ from sitl.world.payload import Payload
 from sitl.world.throws import with_throws
 from tests.support import SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_wait")
+
 CATCH_S, PERIOD_S, KEEP_S = 2.45, 6.0, 1.0
 """Time of the first catch of `TO_AND_FRO`, time between two catches, and time in the net."""
 TO_AND_FRO = (

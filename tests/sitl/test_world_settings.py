@@ -25,8 +25,6 @@ from sitl.fast.team import FastTeam
 from tests.support import HOVER, SHORT_CATCH, set_options
 
 Settings = dict[str, Any]
-TARE_S = 0.1
-"""In the fast loop, instead of the flight's second: nothing but noise happens meanwhile."""
 ELSEWHERE = {
     "World.natnet_version": "the fast loop has no NatNet bytes",
     "World.mocap_other_id": "the fast loop has no stream of several rigid bodies",
@@ -41,10 +39,8 @@ PLATE = {"point_m": (-0.544, -0.03, 0.136), "normal": (0.1, 0.1, 1.0), "size_m":
 
 
 @pytest.fixture(autouse=True)
-def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The wait before take-off is short, and a flight with faults that is ended in the air is not followed to the floor."""
-    monkeypatch.setattr("companion.model.flight_stage.TARE_S", TARE_S)
-    monkeypatch.setattr("companion.mission.settled.SETTLED_S", TARE_S)
+def _short(short_wait: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A flight with faults that is ended in the air is not followed to the floor."""
     monkeypatch.setattr("sitl.fast.loop.SETTLE_S", 0.0)
 
 
