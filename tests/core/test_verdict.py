@@ -266,7 +266,7 @@ def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
     assert flown.effects[1::2] == [(False, "resume refused: on the ground")] * 4
 
 
-def test_it_waits_for_start_with_nothing_sent_and_then_flies_and_a_landing_is_not_held() -> None:
+def test_it_waits_for_start_with_nothing_sent_and_then_flies() -> None:
     lands_s = times_of(ordinary())["land"] + 1.0  # PX4's heartbeats come once a second
     flown = commanded((2.0, HOLD), (3.0, START), (lands_s + 0.2, HOLD), (lands_s + 0.4, RESUME), sets=(*WAITS, *LOW))
     assert flown.effects == [
