@@ -15,6 +15,8 @@ import pytest
 from companion.config.base import JOINTS_MAX
 from tests.recorder.viewers import Viewed, at_path, split_path
 
+pytestmark = pytest.mark.xdist_group("recorded flight")
+
 FOXGLOVE = Path("configs/foxglove/companion.json")
 PLOTJUGGLER = Path("configs/plotjuggler/companion.xml")
 PANELS: dict[str, Any] = {

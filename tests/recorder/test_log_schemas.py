@@ -14,6 +14,8 @@ from tests.recorder.flights import EPOCH_NS, config_json, offer, record, started
 from tests.recorder.viewers import Viewed, protobuf_decoder, view
 from tests.support import DEADLINE_S, wait_until
 
+pytestmark = pytest.mark.xdist_group("recorded flight")
+
 JSON = {
     "/inputs": "companion.Inputs",
     "/outputs": "companion.Outputs",
