@@ -29,13 +29,14 @@ PLANE_M = 0.05
 def contact_summary(log: FlightLog) -> dict[str, Any] | None:
     """Return `contact` of summary.json; None if the mission has no contact phases.
 
-    Force is that along the direction of the approach, as measured in flight: `mean_n` and `rms_error_n` while it is steady,
-    `overshoot_n` from the first touch on. `path_rms_m` is the distance of the tip, across that direction, from the path on which the
-    reference would lead it; for a press that path is a point. During a slide the reference moves, and its path begins where the tip
-    is; force and path are then those of the slides alone, and `slid_m` is the length of the reference's way. `surface` is the plane
-    through the points touched by a probe, or by an approach that turns to the surface. Without those it is the mean point that was
-    touched while the force was steady, and the normal of the touched points or, if they lie too close together, the direction of the
-    approach reversed. Its `points` are those by which it was found.
+    * The force is the measured force along the direction of the approach: `mean_n` and `rms_error_n` while it is steady,
+      `overshoot_n` from the first touch on.
+    * `path_rms_m` is the RMS distance of the tip from its planned position, perpendicular to that direction. The planned position
+      is one point for a press; for a slide it begins where the tip is and moves with the reference.
+    * If the mission slides, force and path are those of the slides alone, and `slid_m` is the length of the planned path.
+    * `surface` is the plane through the points touched by a probe, or by an approach that turns to the surface; `points` is their
+      number. Otherwise `points` is 0, and `point_m` is the mean position of the contact while the force was steady. `normal` is
+      then fitted to the tip's positions or, if they lie too close together, opposite to the approach.
     """
     states = [outputs.contact for outputs in log.outputs]
     last = next((state for state in reversed(states) if state is not None), None)

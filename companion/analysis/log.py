@@ -69,7 +69,7 @@ class FlightLog:
 
     @property
     def clock(self) -> str:
-        """Return the clock that the flight lived on: `simulated` or `real`. In simulated time its latencies are zero."""
+        """Return the clock by which the flight ran: `simulated` or `real`. In simulated time its latencies are zero."""
         return self.metadata.get("flight", {}).get("clock", "real")
 
     @staticmethod

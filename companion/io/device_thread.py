@@ -47,7 +47,8 @@ class DeviceThread:
         """Open the device.
 
         Raises:
-            DeviceError: the device cannot be opened, or is not open at the timeout, with the text `too_late`; it is closed again.
+            DeviceError: the device cannot be opened, or is not open after `timeout_s` (the text is then `too_late`). The device is
+                closed before the error is raised.
         """
         if self._thread is not None:
             raise RuntimeError(f"{self._name} can be opened only once")

@@ -46,8 +46,8 @@ class PoseForwarder:
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """All open devices of a flight. A device is None if the vehicle does not have it, as motion capture if another program feeds PX4,
-    or if PX4 was found armed and the device could not be opened.
+    """All open devices of a flight. A device is None if the vehicle does not have it, or if it could not be opened and PX4 was found
+    armed. Motion capture is also None if another program sends the poses to PX4.
     """
 
     forwarder: PoseForwarder

@@ -26,8 +26,8 @@ class ContactMode(Enum):
 
 
 class ContactShift(Record, frozen=True, kw_only=True):
-    """Straight move of the reference from rest to rest across the direction of an approach, in which yaw and last joint turn as well.
-    Everything is relative to the plan.
+    """A straight move of the reference, from rest to rest, perpendicular to the direction of an approach. Yaw and the last joint turn
+    during the move. All values are relative to the plan.
     """
 
     from_m: Vec3 = (0.0, 0.0, 0.0)

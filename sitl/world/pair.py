@@ -15,7 +15,12 @@ from sitl.world.start import MachineSpec, start_of
 
 
 def pair_scene(members: Sequence[SitlConfig]) -> Scene:
-    """Return the scene of both members, the left one first; the bar is that of its world, where its mission grips it."""
+    """Return the scene of both members.
+
+    Args:
+        members: the left vehicle, then the right one. The left one's mission places the bar, and its world sets how the true bar
+            differs from the planned one.
+    """
     specs = []
     for config in members:
         start = config.mission.start

@@ -40,7 +40,7 @@ class Evaluation:
 
     @property
     def cost(self) -> float:
-        """Return its cost in the laboratories that it has flown."""
+        """Return the cost of the candidate, over the laboratories in which it has flown."""
         return cost_of(self.costs)
 
 
