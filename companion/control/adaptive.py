@@ -15,9 +15,10 @@ All matrices of the paper are diagonal, so that each row of chi = [x y z | roll 
 | `control_law` and its order in a tick     | `AdaptiveController.step` |
 | `tab:control_parameters`                  | configs/controllers/adaptive_paper.yaml |
 | `General_EL_dynamics`, `deviation_error`, `step1` to `boundness` | derivation, not computed; tests/control/test_errata.py |
+| `bound_zeta` to `final`                   | proof (appendix), not computed; tests/control/test_errata.py |
 
-What is corrected is in the section Errata of docs/internals/control-law.md, what is added in Options beyond the paper. A diagonal S,
-which the paper does not have, weights all norms; it is 1 in the preset `paper`.
+"printed:" is followed by the paper's form of a term that is corrected here. The sections Errata and Options beyond the paper of
+docs/internals/control-law.md list what is corrected and what is added. A diagonal S, which the paper does not have, weights all norms.
 """
 
 from __future__ import annotations
@@ -50,14 +51,14 @@ class Row:
         K_d: desired damping, N s/m or N m s/rad. K_p = D Phi (`gain_cond`) and does not appear.
         Phi: 1/s.
         Lambda: gain of s, N s/m or N m s/rad.
-        S: weight of the row in the norms; 0 takes it out.
-        robust_scale: factor on dtau on a vehicle of another inertia.
+        S: weight of the row in the norms and in dtau; 0 takes it out of both.
+        robust_scale: factor on dtau: 1 on the machine for which the gains were found; `for_vehicle` sets it on another.
     """
 
     def __init__(self, M_d: float, K_d: float, Phi: float, Lambda: float, S: float, robust_scale: float) -> None:
         self.M_d: Final = M_d
         self.D: Final = K_d - M_d * Phi
-        """The paper's K_d - M_d Phi, positive (`gain_new`). It stays when `scale` changes Phi: K_d and K_p then follow."""
+        """The paper's K_d - M_d Phi, positive (`gain_new`). `scale` changes Phi and leaves D, so that K_d and K_p change."""
         self.Phi, self.Lambda = Phi, Lambda
         self._mission_Phi: Final = Phi
         self._mission_Lambda: Final = Lambda
@@ -89,7 +90,7 @@ class Row:
         )
 
     def chi_star_ddot(self, chi_d_ddot: float) -> float:
-        """Return chi*'' = chi_d'' - Phi e' + gamma', the acceleration that keeps s; at s = 0 it is that of the target impedance."""
+        """Return chi*'' = chi_d'' - Phi e' + gamma', at which s' = 0; if s = 0 as well, the row moves as its target impedance."""
         return chi_d_ddot - self.Phi * self.e_dot + (self.e_tau - self.D * self.gamma) / self.M_d
 
     def advance(self, dt_s: float) -> None:
@@ -142,7 +143,7 @@ class Adaptation:
             dt_s: step.
             norm_s: ||S s||.
             b: regressor.
-            held: H only leaks, because the actuators were saturated in the last tick, whose effect this tick's s is.
+            held: without its input, H only leaks. Set after a tick with saturated actuators, because this tick's s is its effect.
         """
         if norm_s < self.varpi:
             c = 1.0 + self._bound(b) * norm_s
@@ -195,7 +196,9 @@ class AdaptiveController:
         """Normalised hover thrust, for the log. The hover-thrust estimator sets it before every step."""
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
-        """Run one tick of `dt_s`; see `companion.control.types.Controller`. The numbers are those of docs/internals/control-law.md."""
+        """Run one tick of `dt_s`; see `companion.control.types.Controller`. The numbered comments are the steps of the section One tick
+        in docs/internals/control-law.md. F_d, H, zeta and gamma are those of the last tick until step 9.
+        """
         rows, adaptation, arm, load = self._rows, self._adaptation, self._arm, self._load
         compensation, sent = self._compensation, self._actuation
         saturated_before = sent.any_clipped
@@ -277,7 +280,7 @@ class AdaptiveController:
         )
 
     def _norms(self, chi_ddot: Sequence[float]) -> tuple[float, float, float]:
-        """Return ||S s||, ||S xi|| with xi = [e; e'], and ||S chi''||."""
+        """Return ||S s||, ||S xi|| with xi = [e; e'], and ||S chi''||, all without the rows of the attitude."""
         s_squared = xi_squared = a_squared = 0.0
         for i, row in self._controlled:
             weight, a = row.S_squared, chi_ddot[i]
@@ -287,6 +290,6 @@ class AdaptiveController:
         return math.sqrt(s_squared), math.sqrt(xi_squared), math.sqrt(a_squared)
 
     def scale_gains(self, k: float) -> None:
-        """Set Phi and Lambda of x, y and z to k times those of the mission; D stays."""
+        """Set Phi and Lambda of x, y and z to k times those of the mission."""
         for row in self._rows[:3]:
             row.scale(k)
