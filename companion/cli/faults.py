@@ -104,7 +104,7 @@ def _campaign(arguments: argparse.Namespace) -> Faults:
     if not flights:
         where = " with --wires" if arguments.wires else ""
         kinds, phases = " or ".join(arguments.kinds) or "any", " or ".join(arguments.phases) or "any"
-        raise ConfigError(f"companion faults: no fault to fly{where}: kind {kinds}, phase {phases}")
+        raise ConfigError(f"companion faults: no fault{where} has kind {kinds} and phase {phases}; choose others")
     for override in arguments.overrides:
         if override.partition("=")[0].strip().partition("[")[0] == "world.faults":
             raise ConfigError(

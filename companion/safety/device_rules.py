@@ -181,8 +181,8 @@ DEVICE_RULES: tuple[Rule, ...] = (
     Rule(
         id="joint_states_late", subject=Subject.ARM, what="joint states are late: a slow adapter, a busy bus or a busy computer",
         predicate=arm.joint_states_late, ground=_WARN, air=_WARN,
-        message="in {:.0f} % of the ticks the joint state is older than {:.0f} ms, {:.0f} ms in the mean (limit {:.0f} %); check the "
-        "adapter's latency timer and the computer's load",
+        message="{:.0f} % of the ticks use a joint state older than {:.0f} ms, {:.0f} ms on average (limit {:.0f} % of the ticks); "
+        "check the adapter's latency timer and the computer's load",
     ),
     Rule(
         id="joint_swings", subject=Subject.ARM, what="a joint swings: its rate turns three times in 0.5 s, by 2 rad/s and more",

@@ -198,7 +198,7 @@ RULES: tuple[Rule, ...] = (
     Rule(
         id="tether_snagged", subject=Subject.TETHER, what="the tether pulls although there is slack",
         predicate=flight.tether_snagged, tracked_by=("tether.pull_min_n",), hold_time=0.1, ground=None, air=_LAND,
-        message="the tether pulls with {:.0f} N although {:.2f} m are left: the tether is snagged",
+        message="the tether pulls with {:.0f} N although {:.2f} m of slack are left: the tether is snagged",
     ),
     Rule(
         id="tether_near", subject=Subject.TETHER, what="the tether is close to the rotors or the arm",

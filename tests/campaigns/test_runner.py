@@ -210,7 +210,7 @@ CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
         (("faults", "--kinds", "mocap_los"), r"there is no kind of fault 'mocap_los'; did you mean 'mocap_loss'\?"),
         (("faults", "--phases", "lunch"), r"there is no phase 'lunch'"),
         (("faults", "--set", "world.faults=[]"), r"the campaign sets this key; use --kinds and --phases"),
-        (("faults", "--wires", "--kinds", "gust"), r"no fault to fly with --wires: kind gust, phase any"),
+        (("faults", "--wires", "--kinds", "gust"), r"no fault with --wires has kind gust and phase any"),
         (("faults", "--kinds", "gust,tool_broken"), r"tool_broken need a mission with a contact, got other kinds"),
         (("robustness", "--case", "heavy"), r"--case needs --cases FILE"),
         (("robustness", "--cases", "empty.yaml"), r"empty\.yaml: cases: expected at least one case"),
