@@ -114,7 +114,7 @@ def test_without_an_arm_the_force_on_the_base_is_observed() -> None:
     assert run.still(0.6, state((0.0, 0.0, -1.0), arm=()), contact=True)[2] == pytest.approx(-3.0, abs=0.01)
 
 
-def test_joints_that_moved_while_nothing_was_read_are_no_force() -> None:
+def test_joints_that_moved_during_a_gap_in_the_reads_are_not_taken_for_a_force() -> None:
     run = Run()
     run.still(2.0, state())
     moved = state(arm=(POSE[0] + 0.2, POSE[1]))

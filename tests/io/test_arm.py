@@ -175,7 +175,7 @@ async def test_tripped_watchdog_is_shown_and_started_again() -> None:
         await until(lambda: register(servo, 102, 2) != 0)
 
 
-def test_leaving_lets_go_of_the_arm() -> None:
+def test_closing_the_arm_sets_current_torque_and_watchdog_to_0() -> None:
     async def main() -> list[ServoModel]:
         async with flying_arm() as setup:
             setup.arm.write_torque((0.5, 0.5))

@@ -73,7 +73,7 @@ def test_a_labelled_marker_counts_if_no_body_has_it_and_cameras_see_it(params: i
     assert parsed(labelled(params), "4.1").markers == found
 
 
-def test_sections_of_many_elements_are_read_in_every_place() -> None:
+def test_markers_are_found_in_a_frame_with_two_elements_in_every_section() -> None:
     for version in VERSIONS:
         frame = parsed(full_frame(version), version)
         assert frame.markers == ((1.0, 1.0, 1.0), (1.0, 2.0, 3.0))

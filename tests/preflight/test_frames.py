@@ -90,7 +90,7 @@ def test_a_world_that_was_turned_after_the_body_was_made_is_named(axes: AxisMap)
 
 
 @pytest.mark.parametrize("axes", [axes for axes in ROTATIONS if axes != IDENTITY], ids=lambda a: ",".join(a.names))
-def test_a_body_whose_zero_is_turned_is_named_wherever_it_stands(axes: AxisMap) -> None:
+def test_a_rigid_body_whose_zero_was_set_while_it_was_turned_is_explained(axes: AxisMap) -> None:
     wanted = Wanted((0.4, -0.7, 0.3), math.radians(35.0), 0.15, 15.0)
     truth = quat_from_euler_zyx(0.01, -0.01, wanted.yaw_rad)
     force = quat_rotate(quat_conjugate(truth), G)

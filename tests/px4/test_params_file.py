@@ -175,7 +175,7 @@ def test_the_pilots_radio_is_switched_off_by_a_file_of_its_own() -> None:
     assert BY_NAME["COM_RC_IN_MODE"].value == 4
 
 
-def test_the_table_of_the_docs_is_the_table() -> None:
+def test_the_table_of_parameters_in_the_docs_is_up_to_date() -> None:
     """Made by `python -m tools.docs.px4 .`."""
     page = (ROOT / "docs/internals/px4.md").read_text(encoding="utf-8")
     assert published.table_markdown() in page

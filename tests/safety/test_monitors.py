@@ -102,7 +102,7 @@ WALLS = [(0, 1, 1.81), (0, -1, 1.81), (1, 1, 1.41), (1, -1, 1.41), (2, 1, 2.15)]
 
 
 @pytest.mark.parametrize(("axis", "side", "most_m"), WALLS)
-def test_at_every_side_the_fence_is_where_the_rotors_leave_the_room(axis: int, side: int, most_m: float) -> None:
+def test_on_every_side_the_geofence_is_left_when_the_rotors_leave_the_room(axis: int, side: int, most_m: float) -> None:
     def found(off_m: float, speed_m_s: float) -> list[str]:
         place, velocity = [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]
         place[axis], velocity[axis] = side * (most_m + off_m), side * speed_m_s
@@ -131,7 +131,7 @@ def test_after_a_late_tick_the_loop_is_reported_and_no_device(
     assert [(event.id, event.action) for event in events] == spoken
 
 
-def test_a_mocap_that_stays_away_after_a_hold_up_is_lost() -> None:
+def test_motion_capture_that_stays_silent_after_a_late_tick_is_lost() -> None:
     inputs = [healthy(), *[stopped("mocap")(healthy(k, START_S + 0.2 + k * TICK_S)) for k in range(40)]]
     assert [event.id for event in watched(VEHICLE, inputs, flying())] == ["loop_late", "mocap_lost"]
 

@@ -127,7 +127,7 @@ def test_a_px4_started_by_hand_that_still_runs_after_its_flight_is_found() -> No
     assert "make" in how_to_start_it(0) and "px4 -i 3`" in how_to_start_it(3) and "make" not in how_to_start_it(3)
 
 
-async def test_the_battery_is_sent_as_one_of_px4s_own_system() -> None:
+async def test_the_battery_is_sent_with_px4s_system_id_and_another_component_id() -> None:
     loop = asyncio.get_running_loop()
     with Instance.claim() as instance, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as px4:
         px4.bind(instance.control_address)

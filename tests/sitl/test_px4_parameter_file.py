@@ -58,7 +58,9 @@ async def test_it_waits_for_the_values_and_not_for_their_names(tmp_path: Path) -
     assert await asyncio.wait_for(waiting, DEADLINE_S) == whole
 
 
-def test_values_that_never_come_are_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parameters_that_px4_never_stores_are_reported_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("sitl.px4.parameter_file.STORED_DEADLINE_S", 0.2)
     with pytest.raises(Px4Error, match="expected the changed parameters in"):
         asyncio.run(stored(tmp_path, {"EKF2_EV_CTRL": 11}))

@@ -49,7 +49,7 @@ def test_draws_fill_what_was_asked_for() -> None:
     spread([d["catch_at_m"][0] for d in DRAWS], -0.92, 0.92)
 
 
-def test_the_file_of_the_world_draws_the_rest_by_the_seed_of_the_draw() -> None:
+def test_the_world_file_draws_what_a_draw_does_not_set_from_the_seed_of_the_draw() -> None:
     config = load_sitl(CATCH, world="robustness")
     flown = [flights.with_world(config, knobs).world for knobs in DRAWS[:100]]
     assert [world.seed for world in flown] == [knobs["seed"] for knobs in DRAWS[:100]]
