@@ -72,8 +72,9 @@ def _flown(config: FlightConfig, plan: Plan, phase: Phase, segment: Segment, lab
     """Return the states and the reports of a phase for random inputs, the same on every call."""
     history: list[object] = []
     own: Record | None = None
+    at_s = segment.start_s
     for k, observation in enumerate(_random_observations(plan, segment)):
-        air = _Still(config, plan, segment, observation)
+        air = _Tick(config, plan, segment, observation, at_s)
         own = phase.begin(air) if k == 0 else phase.step(air, own)
         history += [own, *air.reports]
         if own is None:
@@ -84,6 +85,7 @@ def _flown(config: FlightConfig, plan: Plan, phase: Phase, segment: Segment, lab
         values = (*reference.position_world_m, *reference.velocity_world_m_s, reference.yaw_rad, *reference.arm_rad)
         assert all(map(math.isfinite, values)), f"{label}: tick {k} of random inputs: its reference is not finite"
         history += [expected, reference]
+        at_s = air.at_s + TICK_PERIOD_S
     return tuple(history)
 
 
@@ -114,19 +116,27 @@ def _random_observations(plan: Plan, segment: Segment) -> Iterator[Observation]:
         )
 
 
-class _Still(Air):
-    """A tick in which the plan stands at the start of the phase."""
+class _Tick(Air):
+    """A tick in which the plan's time passes, unless the phase holds or moves it."""
 
-    def __init__(self, config: FlightConfig, plan: Plan, segment: Segment, observation: Observation) -> None:
+    def __init__(
+        self, config: FlightConfig, plan: Plan, engaged: Segment, observation: Observation, at_s: float
+    ) -> None:
         vehicle, phases = config.vehicle, phases_of(config.mission)
         limits, safe = config.mission.limits, SafeSet(vehicle)
-        super().__init__(observation, vehicle, manipulator_of(vehicle), phases, segment, segment, limits, safe, True)
-        self._reference = plan.reference(segment.start_s)
+        segment = plan.segment(at_s)
+        super().__init__(observation, vehicle, manipulator_of(vehicle), phases, segment, engaged, limits, safe, True)
+        self._plan = plan
+        self.at_s = at_s
         self.reports: list[object] = []
 
+    def plan_s(self) -> float:
+        """Return the plan's time since the start of the phase."""
+        return self.at_s - self.engaged.start_s
+
     def plan_reference(self) -> Reference:
-        """Return the plan's reference at the start of the phase."""
-        return self._reference
+        """Return the plan's reference at the plan's time."""
+        return self._plan.reference(self.at_s)
 
     def report(self, notice: EventDefinition, text: str) -> None:
         """Record an event."""
@@ -136,9 +146,15 @@ class _Still(Air):
         """Record a failure."""
         self.report(notice, text)
 
+    def resume(self, notice: EventDefinition, text: str) -> None:
+        """Record the end of a hold."""
+        self.report(notice, text)
+
     def stay(self, segment: Segment) -> None:
-        """Do nothing: the plan's time stands."""
+        """Keep the plan's time before the end of a segment."""
+        self.at_s = min(self.at_s, segment.end_s - BEFORE_END_S)
 
     def move_to(self, plan_s: float) -> None:
-        """Record the time."""
+        """Record the time, and move the plan's time to it."""
         self.reports.append(plan_s)
+        self.at_s = plan_s

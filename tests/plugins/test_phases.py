@@ -137,6 +137,15 @@ def test_a_phase_that_breaks_the_contract_is_told_how(site: Path, right: str, wr
     assert "phases[4], weigh" in str(caught.value) and found in str(caught.value)
 
 
+def test_the_contract_lets_the_plans_time_pass(site: Path) -> None:
+    over = "air.t_s - state.since_s < self.duration_s"
+    assert over in CODE
+    code = CODE.replace("        air.stay(air.engaged)\n", "").replace(over, "air.plan_s() < self.duration_s")
+    (site / "lab_weigh.py").write_text(code.replace("air.report(WEIGHED", "assert False, str(air.plan_s())  #"))
+    with pytest.raises(AssertionError, match=r"^2\.0"):
+        check_phases(MISSION)
+
+
 RAISES = {
     "step": ("        air.stay(air.engaged)\n", "        1 / (air.t_s < self.duration_s)\n"),
     "reference": ("    def begin(", "    def reference(self, reference, own):\n        return own.n\n\n    def begin("),
