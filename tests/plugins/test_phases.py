@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import math
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +19,7 @@ from companion.config.phase import PhaseSettings, phase_classes
 from companion.core.flight_core import FlightCore
 from companion.flight.main import plugins_of_others
 from companion.mission.check import check_mission
+from companion.mission.plan import Plan
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.model.types import OperatorCommand, Outcome, SafetyAction
 from companion.plugins import PHASES
@@ -32,6 +35,7 @@ EXAMPLE = ROOT / "examples/phase"
 MISSION = EXAMPLE / "weigh.yaml"
 FILES = ("pyproject.toml", "lab_weigh.py", "weigh.yaml", "test_lab_weigh.py")
 FLOWN = ("circuit", "intercept", "press", "slide", "probe")
+PAGE = (ROOT / "docs/own-phase.md").read_text(encoding="utf-8")
 CODE = (EXAMPLE / "lab_weigh.py").read_text(encoding="utf-8")
 
 
@@ -60,10 +64,9 @@ def test_which_types_the_checked_missions_do_not_have() -> None:
 
 
 def test_the_page_shows_the_files_as_they_are() -> None:
-    page = (ROOT / "docs" / "own-phase.md").read_text(encoding="utf-8")
     for name in FILES:
         kind = {".toml": "toml", ".py": "python", ".yaml": "yaml"}[Path(name).suffix]
-        assert f"`{name}`:\n\n```{kind}\n{(EXAMPLE / name).read_text(encoding='utf-8')}```\n" in page, name
+        assert f"`{name}`:\n\n```{kind}\n{(EXAMPLE / name).read_text(encoding='utf-8')}```\n" in PAGE, name
 
 
 def test_a_phase_of_another_package_keeps_the_contract_and_weighs_the_payload(site: Path) -> None:
@@ -135,6 +138,24 @@ def test_a_phase_that_breaks_the_contract_is_told_how(site: Path, right: str, wr
     with pytest.raises(AssertionError) as caught:
         check_phases(MISSION)
     assert "phases[4], weigh" in str(caught.value) and found in str(caught.value)
+
+
+def test_the_pages_phase_that_moves_keeps_the_contract_and_flies(tmp_path: Path) -> None:
+    (square,) = re.findall(r"^```python\n(class Square.*?)^```", PAGE, flags=re.M | re.S)
+    imports = "import math\nfrom dataclasses import replace\nfrom typing import Annotated\nfrom pydantic import Field\n"
+    (tmp_path / "lab_square.py").write_text(f"{imports}from lab_weigh import Literal, Phase, Planning\n\n{square}")
+    shutil.copy(EXAMPLE / "lab_weigh.py", tmp_path)
+    write_distribution(tmp_path, "lab-square", "0.1.0", {"square": "lab_square:Square"}, PHASES)
+    mission = tmp_path / "square.yaml"
+    hover = (ROOT / "configs/missions/hover.yaml").read_text(encoding="utf-8")
+    moved = hover.replace("type: hold, duration_s: 5.0", "type: square, side_m: 0.8, speed_m_s: 0.4")
+    mission.write_text(moved.replace("../vehicles", str(ROOT / "configs/vehicles")), encoding="utf-8")
+    with on_path(tmp_path):
+        check_phases(mission)
+        plan = Plan.build((config := load_flight(mission)).mission, config.vehicle)
+        turned = plan.reference(plan.segments[1].end_s)
+        assert (turned.position_world_m, turned.yaw_rad) == ((-1.0, 0.0, 1.0), math.pi / 2)
+        assert [event.id for event in check_flight(mission, "world.payload_kg=0")] == ["takeoff", "touchdown"]
 
 
 def test_the_contract_lets_the_plans_time_pass(site: Path) -> None:
