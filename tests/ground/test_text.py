@@ -92,7 +92,7 @@ def test_the_status_word(vehicle: Vehicle, now_s: float, expected: str, alarm: b
 def test_what_is_shown_of_a_flight() -> None:
     text = plain(drawn(known(progress=0.4321, mission_t_s=9.0)))
     for expected in ("rig", "SIMULATION", "adaptive", " 43 %", "t   9.0 s", "|e_p|", "battery 15.8 V", "motion capture", "caught",
-                     "HOLD", "LAND", "ABORT", "anna", "connected to"):  # fmt: skip
+                     "h HOLD", "l LAND", "a ABORT", "r resume   s start", "anna", "connected to"):  # fmt: skip
         assert expected in text, (expected, text)
 
 

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from companion.ground.protocol.messages import EventLine, HealthLevel, Presence, Stream
 from companion.ground.station.vehicles import Vehicle
+from companion.model.commands import TABLE
 from companion.model.types import LandedState, PhaseKind, SafetyAction
 
 STALE_S = 0.3
@@ -194,9 +195,11 @@ def _keys(station: StationStatus) -> Text:
     if station.view_only_reason is not None:
         return Text(f"q quit    view only: {printable(station.view_only_reason)}", style="dim")
     text = Text()
-    for key, name, style in (("h", "HOLD", "bold yellow"), ("l", "LAND", "bold yellow"), ("a", "ABORT", "bold red")):
-        text.append(f"{key} ", style="bold").append(f"{name}   ", style=style)
-    return text.append(f"r resume   s start   q quit    you are {station.operator}", style="dim")
+    for row in reversed([row for row in TABLE if row.safer]):
+        style = "bold red" if row is TABLE[0] else "bold yellow"
+        text.append(f"{row.key} ", style="bold").append(f"{row.command.value.upper()}   ", style=style)
+    confirmed = "".join(f"{row.key} {row.command.value}   " for row in TABLE if not row.safer)
+    return text.append(f"{confirmed}q quit    you are {station.operator}", style="dim")
 
 
 def _autopilot(stream: Stream) -> str:
