@@ -1,7 +1,7 @@
 """Faults of the simulated world: the kinds, the meaning of their sizes, and the settings of one injected fault.
 
 The world, `companion faults --list` and docs/internals/faults.md use the same table. `sitl.faults` implements the effect of each kind;
-`companion.campaigns.faults.variants` lists the faults that a campaign flies.
+a campaign flies each with its default size, or as `companion.campaigns.faults.variants` lists it.
 """
 
 from __future__ import annotations
@@ -86,18 +86,18 @@ KINDS: dict[str, Kind] = {
     "mocap_flicker": Kind(
         what="every second pose is shifted sideways", size="shift", unit="m", default=0.3, named_by=_MOCAP_WRONG
     ),
-    "mocap_network": Kind(
-        what="frames wait on the network, after the server has stamped them",
-        size="additional delay",
-        unit="s",
-        default=0.15,
-        named_by=("mocap_late", *_MOCAP_GONE, *_MOCAP_WRONG),
-    ),
     "mocap_latency": Kind(
         what="frames leave the motion-capture computer later",
         size="additional latency",
         unit="s",
         default=0.1,
+        named_by=("mocap_late", *_MOCAP_GONE, *_MOCAP_WRONG),
+    ),
+    "mocap_network": Kind(
+        what="frames wait on the network, after the server has stamped them",
+        size="additional delay",
+        unit="s",
+        default=0.15,
         named_by=("mocap_late", *_MOCAP_GONE, *_MOCAP_WRONG),
     ),
     "mocap_rate": Kind(
@@ -177,9 +177,7 @@ KINDS: dict[str, Kind] = {
         ),
         signed=True,
     ),
-    "motor_weak": Kind(
-        what="a rotor loses thrust", size="fraction lost", unit="", default=0.15, named_by=(*_WEAK, "crashed")
-    ),
+    "motor_weak": Kind(what="a rotor loses thrust", size="fraction lost", unit="", default=0.15, named_by=_WEAK),
     "battery_sag": Kind(
         what="the battery's voltage drops, and the thrust with the square of the voltage",
         size="drop",

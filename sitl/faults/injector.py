@@ -1,7 +1,5 @@
 """Injects the faults of the simulated world: their schedule, and their effect on physics, sensors and PX4.
 
-The kinds of fault are defined in companion/sitl_config/faults.py (`KINDS`); begin there to add one.
-
 The plant calls `Faults.step` in every step. `sitl.server` and the fast closed loop read faults of the link, the servo bus and the
 processes from `active`.
 """

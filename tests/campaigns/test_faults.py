@@ -12,7 +12,7 @@ import pytest
 from companion.campaigns.faults.judge import FaultFlight, Point, Tick, good, row_of
 from companion.campaigns.faults.sitl_flights import _offset_s
 from companion.campaigns.faults.sitl_flights import flown as flown_over_wires
-from companion.campaigns.faults.variants import CONTACT, VARIANTS, Variant, planned
+from companion.campaigns.faults.variants import CHOSEN, CONTACT, VARIANTS, Variant, planned
 from companion.cli.main import main
 from companion.launcher.launcher import FlightResult
 from companion.launcher.run import summary_of
@@ -154,6 +154,7 @@ def test_the_table_of_kinds_names_events_that_exist() -> None:
 def test_the_campaign_flies_every_kind_of_fault_with_a_size_where_it_has_one() -> None:
     assert len(set(VARIANTS)) == len(VARIANTS)
     assert {variant.kind for variant in (*VARIANTS, *CONTACT)} == set(KINDS)
+    assert {variant.kind for variant in CHOSEN} < set(KINDS)
     for variant in (*VARIANTS, *CONTACT):
         assert (variant.size is not None) == (KINDS[variant.kind].size is not None), variant
 

@@ -196,7 +196,6 @@ def test_knobs_match() -> None:
     assert list(told) == [name for name in World.model_fields if name not in effects]
     switches = {name for row in table(LABORATORY, "effect", "what it does") for name in codes(row[4])}
     assert {f"{name}.on" for name in effects} <= switches
-    assert f"{len(KINDS)} kinds" in text_of(SITL)
 
 
 def test_faults_match() -> None:

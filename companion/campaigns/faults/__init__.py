@@ -1,6 +1,5 @@
 """`companion faults`: flights with one fault each.
 
-`variants` lists the faults that are flown, with sizes and durations. To add a kind of fault, define it in
-`companion.sitl_config.faults` (`KINDS`) and implement its effect in `sitl.faults`. `judge` determines the outcome
-of a flight and the values of its row; `campaign` makes the tables.
+`variants` lists the faults that are flown, with sizes and durations; `sitl.faults` says how to add a kind. `judge` determines
+the outcome of a flight and the values of its row; `campaign` makes the tables.
 """

@@ -45,33 +45,25 @@ def _sizes(kind: FaultKind, *sizes: float, duration_s: float | None = None) -> l
     return [Variant(kind, size, duration_s) for size in sizes]
 
 
-VARIANTS: tuple[Variant, ...] = (
+CHOSEN: tuple[Variant, ...] = (
     *_durations("mocap_loss", 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, None),
     *_durations("mocap_occluded", 0.1, None),
     *_sizes("mocap_jump", 0.08, 0.3),
     *_sizes("mocap_jump", 1.0, duration_s=0.05),
-    *_sizes("mocap_drag", 1.0),
     *_sizes("mocap_swap", 1.0),
     *_sizes("mocap_swap", 0.6, duration_s=0.08),
     *_durations("mocap_freeze", 0.08, None),
-    *_sizes("mocap_flip", 180.0),
-    *_sizes("mocap_flicker", 0.3),
     *_sizes("mocap_latency", 0.05, 0.2),
     *_sizes("mocap_network", 0.06, 0.1, 0.15, 0.18),
     *_sizes("mocap_rate", 60.0, 5.0),
     *_durations("link_loss", 0.1, 0.5, None),
     *_sizes("link_delay", 0.005, 0.015, 0.03, 0.04, 0.05, 0.07, 0.15),
-    *_sizes("autopilot_reboot", 2.0),
-    *_durations("offboard_refused", None),
-    *_durations("arming_refused", None),
     *_durations("servo_loss", 0.05, None),
-    *_durations("servo_overload", None),
     *_sizes("servo_hot", 70.0, 85.0),
     *_sizes("servo_angle", 10.0, 40.0),
     *_sizes("bus_noise", 0.1, 0.6),
     *_sizes("bus_delay", 0.002, 0.004, 0.006, 0.008, 0.01, 0.012),
     *_durations("force_loss", 0.2, None),
-    *_durations("force_stuck", None),
     *_sizes("force_bias", 2.0, 10.0),
     *_sizes("motor_weak", 0.1, 0.4),
     *_sizes("battery_sag", 2.0, 4.0),
@@ -79,21 +71,16 @@ VARIANTS: tuple[Variant, ...] = (
     *_sizes("gust", 8.0, duration_s=0.7),
     *_sizes("tether_taut", 0.05, 0.15),
     *_sizes("tether_snag", 0.05, 0.3),
-    *_durations("tether_cut", None),
-    *_sizes("payload_missed", 0.4),
-    *_sizes("payload_double", 0.2),
-    *_durations("payload_dropped", None),
-    *_sizes("payload_heavy", 0.6),
-    *_durations("disk_full", None),
-    *_sizes("clock_step", 5.0),
     *_durations("stall_loop", 0.06, None),
-    *_durations("hold_gil", None),
     *_durations("stop_flight", 0.08, None),
-    *_durations("kill_flight", None),
-    *_durations("kill_recorder", None),
-    *_durations("kill_guardian", None),
-    *_sizes("pilot_takeover", 3.0),
-    *_durations("kill_switch", None),
+)
+"""Faults of the kinds that are not flown just once, with the default size and to the end of the flight."""
+
+VARIANTS: tuple[Variant, ...] = tuple(
+    variant
+    for kind, about in KINDS.items()
+    if about.phases != CONTACT_PHASES
+    for variant in [chosen for chosen in CHOSEN if chosen.kind == kind] or [Variant(kind, about.default)]
 )
 """Faults of a campaign in the fast loop, each in every phase of its kind."""
 
