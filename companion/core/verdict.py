@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import assert_never
 
 from companion.core.flight_state import FlightState
 from companion.model.flight_stage import ROTORS_MAY_START, Stage
@@ -87,7 +88,13 @@ def verdict_of(
         return _hold(before, after, kind, texts)
     if before.supervisor.action.rank >= SafetyAction.LAND.rank:
         return Verdict(accepted=True, answer=Answer.ALREADY_LANDING)
-    return Verdict(accepted=True, answer=Answer.LANDING if command is OperatorCommand.LAND else Answer.ABORTED)
+    if command is OperatorCommand.LAND:
+        return Verdict(accepted=True, answer=Answer.LANDING)
+    if command is OperatorCommand.ABORT:
+        return Verdict(accepted=True, answer=Answer.ABORTED)
+    if command is OperatorCommand.NONE:
+        raise ValueError("no command has no verdict")
+    assert_never(command)  # a new command needs an answer of its own
 
 
 def _hold(before: FlightState, after: FlightState, kind: PhaseKind, texts: Mapping[str, str]) -> Verdict:
