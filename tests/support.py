@@ -40,21 +40,6 @@ CATCH = ROOT / "configs/missions/catch.yaml"
 HOVER = ROOT / "configs/missions/hover.yaml"
 SHORT_CATCH = ROOT / "tests/short_catch.yaml"
 """For tests of what is done with a flight, whatever is flown."""
-SHORT_CARRY = (
-    "mission.phases[0]={type: takeoff, height_m: 0.6, duration_s: 1.8}",
-    "mission.phases[1].above_m=0.1",
-    "mission.phases[1].lower_s=1.2",
-    "mission.phases[2].lift_m=0.25",
-    "mission.phases[2].lift_s=2",
-    "mission.phases[2].waypoints=[{position_m: [-0.85, 0.0], yaw_deg: 85.0}]",
-    "mission.phases[3].rise_s=1.4",
-    "mission.phases[3].apart_s=2.6",
-    "mission.phases[4].speed_m_s=0.4",
-    "vehicle.safety.land_speed_m_s=0.5",
-    "left.mission.start.position_m=[-1.0, 1.25]",
-    "right.mission.start.position_m=[-1.0, -1.25]",
-)
-"""The same for the team `carry`, as overrides: one short way instead of three."""
 DEADLINE_S = 240.0
 """For everything that a test waits for: far beyond what it takes, on a loaded machine too."""
 IN_BACKGROUND = ("sh", "-c", 'trap "" INT TERM CHLD; exec "$@"', "sh")

@@ -6,7 +6,8 @@ import csv
 import json
 from pathlib import Path
 
-from tests.support import SHORT_CARRY, run_here
+from tests.short_carry import SHORT_CARRY
+from tests.support import run_here
 
 
 def test_a_team_is_flown_in_drawn_laboratories_and_its_rows_carry_the_figures_of_the_bar(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from companion.model.verdict import Answer
 from companion.sitl_config.team import load_team
 from sitl.fast.result import FastResult
 from sitl.fast.team import FastTeam, TeamResult
-from tests.support import SHORT_CARRY
+from tests.short_carry import SHORT_CARRY
 
 Commands = Sequence[Mapping[float, OperatorCommand]]
 
