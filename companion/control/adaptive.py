@@ -241,7 +241,8 @@ class AdaptiveController:
         joints = arm.with_inertia(joints, state, star_ddot)
         joints = compensation.joint_torque_nm(joints, star_rate)
         # 8: saturation, attitude and thrust
-        sent.step(dt_s, (x, y, z + self._weight_n), joints, body_z, reference.yaw_rad, vertical_scale)
+        yaw_rad, yaw_rate_rad_s = reference.yaw_rad, reference.yaw_rate_rad_s
+        sent.step(dt_s, (x, y, z + self._weight_n), joints, body_z, yaw_rad, vertical_scale, yaw_rate_rad_s)
         compensation.remember(sent.force_world_n, F_ext)
 
         # 9: adaptive_law_full, adaptive_1; beyond the paper F_d and the loads

@@ -6,6 +6,7 @@ Everything here runs in the control tick and is therefore written in plain float
 from __future__ import annotations
 
 import math
+from typing import Final
 
 from companion.config.controller import LawConfig
 from companion.config.vehicle import Vehicle
@@ -20,9 +21,12 @@ from companion.control.thrust import (
 from companion.control.types import PlantState, Wrench
 from companion.model.algebra import minus
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.frames import wrap_rad
+from companion.model.frames import quat_multiply, wrap_rad
 from companion.model.outputs import ControlLog
 from companion.model.types import IDENTITY_QUAT, Chi, Joints, Quat, Reference, Vec3
+
+PX4_YAW_P: Final = 2.8
+"""Rate of yaw at which PX4 turns, for each rad of its error, 1/s: the default of MC_YAW_P."""
 
 
 def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[Chi, Chi]:
@@ -152,6 +156,7 @@ class Actuation:
         body_z_world: Vec3,
         yaw_rad: float,
         vertical_scale: float,
+        yaw_rate_rad_s: float = 0.0,
     ) -> None:
         """Run one tick.
 
@@ -162,6 +167,7 @@ class Actuation:
             body_z_world: current direction of the body's z axis.
             yaw_rad: desired yaw.
             vertical_scale: as in `companion.control.types.Controller`.
+            yaw_rate_rad_s: desired rate of yaw.
         """
         force, clipped_z, clipped_xy = saturate_force(force_world_n, self._limits)
         if vertical_scale < 1.0:
@@ -170,6 +176,11 @@ class Actuation:
         roll, pitch = roll_pitch_from_force(force, yaw_rad)
         roll, pitch = self._tilt.step(dt_s, roll, pitch)
         self.attitude_wxyz = attitude_from_roll_pitch_yaw(roll, pitch, yaw_rad)
+        if yaw_rate_rad_s:
+            # PX4 turns at a rate proportional to the error of yaw, and would lag: the setpoint leads by as much, about body z, which
+            # leaves the direction of thrust.
+            half_rad = 0.5 * yaw_rate_rad_s / PX4_YAW_P
+            self.attitude_wxyz = quat_multiply(self.attitude_wxyz, (math.cos(half_rad), 0.0, 0.0, math.sin(half_rad)))
         self.roll_pitch_yaw_rad = (roll, pitch, yaw_rad)
         collective = collective_n(force, body_z_world)
         self.collective_n = collective if collective > 0.0 else 0.0

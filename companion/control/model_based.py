@@ -75,6 +75,7 @@ class ModelBasedLaw(ABC):
             body_x_z_axes_world(state.attitude_wxyz)[1],
             reference.yaw_rad,
             vertical_scale,
+            reference.yaw_rate_rad_s,
         )
         compensation.remember(sent.force_world_n, F_ext)
         self._desired.advance(dt_s, F_ext)

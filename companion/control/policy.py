@@ -108,7 +108,7 @@ class SteeredLaw:
             self.set_action(self._decide(self._observe(state, reference, wrench, body_z)))
         self._ticks += 1
         sent = self._actuation
-        sent.step(dt_s, force_n, torque_nm, body_z, reference.yaw_rad, vertical_scale)
+        sent.step(dt_s, force_n, torque_nm, body_z, reference.yaw_rad, vertical_scale, reference.yaw_rate_rad_s)
         before = wrench.log.saturated if share else sent.clipped
         z, xy, arm = [own or of_base for own, of_base in zip(sent.clipped, before, strict=True)]
         log = replace(

@@ -18,7 +18,7 @@ from companion.control.common import Actuation, DesiredForce, ForceFilter, track
 from companion.control.thrust import ForceLimits, TiltFilter, saturate_force
 from companion.control.types import PlantState
 from companion.mission.reference import at_rest
-from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.frames import quat_from_euler_zyx, quat_rotate, yaw_from_quat
 from companion.model.types import Vec3
 
 CONFIG = load_flight("configs/missions/catch.yaml")
@@ -82,6 +82,15 @@ def test_whatever_a_law_asks_for_thrust_tilt_and_force_stay_within_the_limits(
     thrust = quat_rotate(found.attitude_wxyz, UP)
     share = math.hypot(x, y, z)
     assert thrust == pytest.approx((x / share, y / share, z / share), abs=2e-3)
+
+
+def test_a_setpoint_that_turns_leads_by_what_px4_would_lag_and_leaves_the_thrust_where_it_was() -> None:
+    at_rest, turning = actuation(), actuation()
+    for found, rate_rad_s in ((at_rest, 0.0), (turning, 0.56)):
+        found.step(10.0, (4.0, -3.0, WEIGHT_N), (0.0, 0.0), UP, 0.7, 1.0, rate_rad_s)
+    assert yaw_from_quat(turning.attitude_wxyz) - yaw_from_quat(at_rest.attitude_wxyz) == pytest.approx(0.2, abs=0.01)
+    assert quat_rotate(turning.attitude_wxyz, UP) == pytest.approx(quat_rotate(at_rest.attitude_wxyz, UP))
+    assert turning.roll_pitch_yaw_rad == at_rest.roll_pitch_yaw_rad, "what the vehicle is to do"
 
 
 def test_upside_down_there_is_no_thrust() -> None:

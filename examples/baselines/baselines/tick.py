@@ -156,6 +156,7 @@ class Baseline(ABC):
             body_z,
             reference.yaw_rad,
             vertical_scale,
+            reference.yaw_rate_rad_s,
         )
         thrust_n = sent.collective_n if state.airborne else self.mass_kg * GRAVITY_M_S2
         share = 1.0 - exp(-dt_s / self._lag_s) if self._lag_s > 0.0 else 1.0

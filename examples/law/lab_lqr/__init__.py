@@ -81,7 +81,8 @@ class LqrLaw:
         )
         sent, body_z = self._actuation, body_x_z_axes_world(state.attitude_wxyz)[1]
         wanted = (x, y, z + self._mass_kg * GRAVITY_M_S2)
-        sent.step(dt_s, wanted, self._arm(state, error[6:], rate[6:]), body_z, reference.yaw_rad, vertical_scale)
+        joints = self._arm(state, error[6:], rate[6:])
+        sent.step(dt_s, wanted, joints, body_z, reference.yaw_rad, vertical_scale, reference.yaw_rate_rad_s)
         clipped_z, clipped_xy, _ = sent.clipped
         for i, clipped in enumerate((clipped_xy, clipped_xy, clipped_z)):
             if state.airborne and not clipped:
