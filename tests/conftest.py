@@ -61,8 +61,8 @@ def pytest_configure() -> None:
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Return the number of workers of `pytest -n auto`: two on each processor, because many tests wait for other processes."""
-    return 2 * len(os.sched_getaffinity(0))
+    """Return the number of workers of `pytest -n auto`: three on each processor, because many tests wait for other processes."""
+    return 3 * len(os.sched_getaffinity(0))
 
 
 @pytest.fixture
