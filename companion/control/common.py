@@ -27,6 +27,8 @@ from companion.model.types import IDENTITY_QUAT, Chi, Joints, Quat, Reference, V
 
 PX4_YAW_P: Final = 2.8
 """Rate of yaw at which PX4 turns, for each rad of its error, 1/s: the default of MC_YAW_P."""
+YAW_LEAD_MAX_RAD: Final = 0.5
+"""Largest lead of the yaw setpoint, that of 80 deg/s: a phase that states its rate in other units does not spin the vehicle."""
 
 
 def tracking_errors(state: PlantState, reference: Reference, yaw_rad: float) -> tuple[Chi, Chi]:
@@ -179,7 +181,8 @@ class Actuation:
         if yaw_rate_rad_s:
             # PX4 turns at a rate proportional to the error of yaw, and would lag: the setpoint leads by as much, about body z, which
             # leaves the direction of thrust.
-            half_rad = 0.5 * yaw_rate_rad_s / PX4_YAW_P
+            lead_rad = yaw_rate_rad_s / PX4_YAW_P
+            half_rad = 0.5 * min(max(lead_rad, -YAW_LEAD_MAX_RAD), YAW_LEAD_MAX_RAD)  # in this order NaN stays NaN
             self.attitude_wxyz = quat_multiply(self.attitude_wxyz, (math.cos(half_rad), 0.0, 0.0, math.sin(half_rad)))
         self.roll_pitch_yaw_rad = (roll, pitch, yaw_rad)
         collective = collective_n(force, body_z_world)

@@ -61,9 +61,9 @@ class TeamTracker:
         bar = i.bar
         age_s = self._bar_age.update(awake_s, bar.stamp_s if bar is not None and bar.tracking_valid else None)
         self.bar_unseen_s = self.bar_tilt_deg = 0.0
-        if bar is not None and self.grip is Grip.CARRYING:
+        if self.grip is Grip.CARRYING and (bar is not None or age_s < math.inf):
             self.bar_unseen_s = age_s
-            if age_s <= BAR_UNSEEN_S:
+            if bar is not None and age_s <= BAR_UNSEEN_S:
                 _, _, up = quat_rotate(bar.attitude_wxyz, (1.0, 0.0, 0.0))
                 self.bar_tilt_deg = math.degrees(math.asin(max(-1.0, min(1.0, abs(up)))))
 

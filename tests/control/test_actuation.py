@@ -93,6 +93,18 @@ def test_a_setpoint_that_turns_leads_by_what_px4_would_lag_and_leaves_the_thrust
     assert turning.roll_pitch_yaw_rad == at_rest.roll_pitch_yaw_rad, "what the vehicle is to do"
 
 
+@pytest.mark.parametrize("rate_rad_s", [30.0, -30.0, math.nan])
+def test_a_rate_of_yaw_in_other_units_leads_by_half_a_radian_and_one_that_is_no_number_is_left_to_the_gate(
+    rate_rad_s: float,
+) -> None:
+    found = actuation()
+    found.step(10.0, (0.0, 0.0, WEIGHT_N), (0.0, 0.0), UP, 0.7, 1.0, rate_rad_s)
+    if math.isnan(rate_rad_s):
+        assert math.isnan(found.attitude_wxyz[0])
+    else:
+        assert yaw_from_quat(found.attitude_wxyz) == pytest.approx(0.7 + math.copysign(0.5, rate_rad_s))
+
+
 def test_upside_down_there_is_no_thrust() -> None:
     found = actuation()
     found.step(DT_S, (0.0, 0.0, WEIGHT_N), (0.0, 0.0), (0.0, 0.0, -1.0), 0.0, 1.0)

@@ -10,6 +10,8 @@ from msgspec.structs import replace
 
 from companion.model.team import BarPose, ClampState, Grip, PartnerState, TeamState, Together
 from companion.model.types import Inputs, OperatorCommand
+from companion.safety.flight_context import FlightContext
+from companion.safety.team import TeamTracker, bar_tilted, bar_unseen
 from companion.safety.validity import InputFilter
 
 SAID = TeamState(
@@ -62,3 +64,10 @@ def test_a_bar_out_of_sight_may_have_any_pose() -> None:
     unseen = replace(RECORDS["bar"], tracking_valid=False, position_world_m=(math.nan,) * 3)
     inputs = replace(SOUND, bar=unseen)
     assert InputFilter().clean(inputs) is inputs
+
+
+def test_a_bar_whose_values_are_not_valid_any_more_is_one_that_is_not_seen() -> None:
+    tracker, carrying = TeamTracker(), FlightContext(True, True, 0.0, grip=Grip.CARRYING)
+    tracker.update(SOUND, carrying, 1.0)
+    tracker.update(replace(SOUND, bar=None), carrying, 1.6)
+    assert bar_unseen(tracker, None) is not None and bar_tilted(tracker, None) is None

@@ -49,7 +49,7 @@ class Step:
 def steps_of(arm: Arm) -> tuple[Step, ...]:
     """Return the steps for an arm, within its limits: straight, then each joint alone, from the last one to the shoulder.
 
-    The planar arm of two joints is told where its links point; of any other arm, only the vehicle file defines the directions.
+    For the planar arm of two joints the steps name the directions of its links; for any other arm, only the vehicle file defines them.
 
     Raises:
         ConfigError: the joint limits of a planar arm allow no straight pose, or a joint has too small a range.
