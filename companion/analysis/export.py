@@ -17,9 +17,10 @@ from companion.model.units import unit_of
 ABOUT = "columns.json"
 """File beside the tables: for each table its rate, and for each column its unit and frame."""
 _FRAMES: Final = ("world", "body", "sensor", "ned")
-_CODEBASE, _CHUNK = "v2.1", 1000
-"""Version of the LeRobot dataset's layout, and the number of episodes in one of its folders."""
-_DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+_CODEBASE, _CHUNK = "v3.0", 1000
+"""Version of the LeRobot dataset's layout, and the number of files in one of its folders; each file holds an episode."""
+_FILE = "{chunk_index:03d}/file-{file_index:03d}.parquet"
+_DATA, _EPISODES = f"data/chunk-{_FILE}", f"meta/episodes/chunk-{_FILE}"
 _INDICES = ("frame_index", "episode_index", "index", "task_index")
 
 
@@ -83,7 +84,7 @@ _VECTORS = {
 
 
 def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
-    """Write flights as a LeRobot dataset of version 2.1, one episode each; return the number of frames.
+    """Write flights as a LeRobot dataset of version 3.0, one episode each; return the number of frames.
 
     A frame is a tick in which everything is known: the law flew, and its command was sent. `timestamp` counts them at the nominal
     rate; `t_s` is the flight clock.
@@ -97,8 +98,6 @@ def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
         LogError: a flight has no such tick, or the flights do not belong into one dataset.
         OSError: a file cannot be written.
     """
-    import pandas
-
     episodes = [_episode(log) for log in logs]
     names = {key: list(table.columns) for key, table in episodes[0].items()}
     for log, episode in zip(logs, episodes, strict=True):
@@ -117,7 +116,7 @@ def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
         "t_s": _scalar("float64"),
         **{key: _scalar("int64") for key in _INDICES},
     }
-    described, statistics, begun = [], [], 0
+    described, every, begun = [], [], 0
     for number, (log, episode) in enumerate(zip(logs, episodes, strict=True)):
         vectors = {key: table.to_numpy(np.float32) for key, table in episode.items()}
         count = len(vectors["action"])
@@ -128,24 +127,39 @@ def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
             "t_s": episode["action"].index.to_numpy(),
             **dict(zip(_INDICES, (frames, frames * 0 + number, frames + begun, frames * 0 + task), strict=True)),
         }
-        path = out / _DATA.format(episode_chunk=number // _CHUNK, episode_index=number)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lists = {key: list(value) for key, value in vectors.items()}
-        pandas.DataFrame({**lists, **scalars}).to_parquet(path, index=False)
-        described.append({"episode_index": number, "tasks": [tasks[task]], "length": count})
-        columns = {**vectors, **{key: value[:, None] for key, value in scalars.items()}}
-        statistics.append(
-            {"episode_index": number, "stats": {key: _statistics(value) for key, value in columns.items()}}
+        place = {"chunk_index": number // _CHUNK, "file_index": number % _CHUNK}
+        _write_parquet(out / _DATA.format(**place), {key: list(value) for key, value in {**vectors, **scalars}.items()})
+        every.append({**vectors, **{key: value[:, None] for key, value in scalars.items()}})
+        described.append(
+            {
+                "episode_index": number,
+                "tasks": [tasks[task]],
+                "length": count,
+                "dataset_from_index": begun,
+                "dataset_to_index": begun + count,
+                **{f"data/{key}": value for key, value in place.items()},
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+                **{
+                    f"stats/{key}/{name}": found
+                    for key, value in every[-1].items()
+                    for name, found in _statistics(value).items()
+                },
+            }
         )
         begun += count
+    _write_parquet(
+        out / _EPISODES.format(chunk_index=0, file_index=0),
+        {key: [row[key] for row in described] for key in described[0]},
+    )
+    _write_parquet(out / "meta/tasks.parquet", {"task_index": range(len(tasks))}, index=tasks)
+    statistics = {key: _statistics(np.concatenate([columns[key] for columns in every])) for key in every[0]}
     info = {
         "codebase_version": _CODEBASE,
         "robot_type": _named(logs[0], "vehicle"),
         "total_episodes": len(logs),
         "total_frames": begun,
         "total_tasks": len(tasks),
-        "total_videos": 0,
-        "total_chunks": -(-len(logs) // _CHUNK),
         "chunks_size": _CHUNK,
         "fps": round(1.0 / TICK_PERIOD_S),
         "splits": {"train": f"0:{len(logs)}"},
@@ -153,15 +167,18 @@ def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
         "video_path": None,
         "features": features,
     }
-    meta = out / "meta"
-    meta.mkdir()
-    (meta / "info.json").write_text(json.dumps(info, indent=4) + "\n", encoding="utf-8")
     units = {key: {column: about_column(column) for column in columns} for key, columns in names.items()}
-    (out / ABOUT).write_text(json.dumps({"rate_hz": info["fps"], "columns": units}, indent=1) + "\n", encoding="utf-8")
-    listed = [{"task_index": index, "task": task} for index, task in enumerate(tasks)]
-    for name, rows in (("tasks", listed), ("episodes", described), ("episodes_stats", statistics)):
-        (meta / f"{name}.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")
+    about = {"rate_hz": info["fps"], "columns": units}
+    for path, content in (("meta/info.json", info), ("meta/stats.json", statistics), (ABOUT, about)):
+        (out / path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     return begun
+
+
+def _write_parquet(path: Path, columns: dict[str, Any], index: Sequence[str] | None = None) -> None:
+    import pandas
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pandas.DataFrame(columns, index=index).to_parquet(path, index=index is not None)
 
 
 def _episode(log: FlightLog) -> dict[str, Any]:

@@ -1,11 +1,10 @@
-"""What `companion export` writes, read back by pandas, and a LeRobot dataset by its published layout (version 2.1)."""
+"""What `companion export` writes, read back by pandas, and a LeRobot dataset by its published layout (version 3.0)."""
 
 from __future__ import annotations
 
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas
@@ -42,10 +41,6 @@ def test_a_table_holds_the_log_with_units_and_rate(path: Path, tmp_path: Path, s
     assert about[f"outputs.{suffix}"]["columns"]["arm_torque_nm[0]"] == {"unit": "N m", "frame": None}
 
 
-def lines_of(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-
-
 def test_a_dataset_has_the_layout_of_lerobot_and_the_values_of_the_logs(path: Path, tmp_path: Path) -> None:
     second = tmp_path / "B" / "flight.mcap"
     second.parent.mkdir()
@@ -53,14 +48,21 @@ def test_a_dataset_has_the_layout_of_lerobot_and_the_values_of_the_logs(path: Pa
     out = tmp_path / "set"
     assert main(["export", str(path), str(second), "--format", "lerobot", "--out", str(out)]) == 0
     info = json.loads((out / "meta/info.json").read_text(encoding="utf-8"))
-    assert (info["codebase_version"], info["fps"], info["total_episodes"]) == ("v2.1", 200, 2)
-    episodes, tasks = lines_of(out / "meta/episodes.jsonl"), lines_of(out / "meta/tasks.jsonl")
+    assert (info["codebase_version"], info["fps"], info["total_episodes"]) == ("v3.0", 200, 2)
+    episodes = pandas.read_parquet(out / "meta/episodes/chunk-000/file-000.parquet").to_dict("records")
+    tasks = pandas.read_parquet(out / "meta/tasks.parquet")
+    statistics = json.loads((out / "meta/stats.json").read_text(encoding="utf-8"))
     log = FlightLog.read(path)
     flown = [(i, o) for i, o, _ in log.rows() if o.control is not None and o.attitude is not None]
     assert [episode["length"] for episode in episodes] == [len(flown)] * 2 == [info["total_frames"] // 2] * 2
-    assert episodes[0]["tasks"] == [tasks[0]["task"]]
-    for number in range(2):
-        frames = pandas.read_parquet(out / info["data_path"].format(episode_chunk=0, episode_index=number))
+    assert list(episodes[0]["tasks"]) == list(tasks.index[[0]])
+    assert [(e["dataset_from_index"], e["dataset_to_index"]) for e in episodes] == [
+        (0, len(flown)),
+        (len(flown), 2 * len(flown)),
+    ]
+    for number, episode in enumerate(episodes):
+        place = {key: episode[f"data/{key}"] for key in ("chunk_index", "file_index")}
+        frames = pandas.read_parquet(out / info["data_path"].format(**place))
         assert set(frames.columns) == set(info["features"])
         assert frames["index"].tolist() == list(range(number * len(flown), (number + 1) * len(flown)))
         assert frames["t_s"].tolist() == [i.t_s for i, _ in flown]
@@ -79,8 +81,9 @@ def test_a_dataset_has_the_layout_of_lerobot_and_the_values_of_the_logs(path: Pa
             assert stacked.shape == (len(flown), *feature["shape"])
             column = stacked[:, feature["names"].index(name)]
             assert column.tolist() == np.array(wanted, np.float32).tolist()
-            stats = lines_of(out / "meta/episodes_stats.jsonl")[number]["stats"][key]
-            assert stats["max"][feature["names"].index(name)] == column.max()
+            at = feature["names"].index(name)
+            assert episode[f"stats/{key}/max"][at] == statistics[key]["max"][at] == column.max()
+            assert statistics[key]["count"] == [2 * len(flown)]
 
 
 def test_what_cannot_be_exported_is_refused_in_one_line(
@@ -99,3 +102,16 @@ def test_what_cannot_be_exported_is_refused_in_one_line(
         err = capsys.readouterr().err
         assert err.count("\n") == 1
         assert reason in err
+
+
+def test_lerobot_reads_the_dataset(path: Path, tmp_path: Path) -> None:
+    """Where LeRobot's package is installed, which needs PyTorch."""
+    datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
+    assert main(["export", str(path), str(path), "--format", "lerobot", "--out", str(tmp_path / "set")]) == 0
+    read = datasets.LeRobotDataset("laboratory/flights", root=tmp_path / "set", episodes=[1])
+    written = pandas.read_parquet(tmp_path / "set/data/chunk-000/file-001.parquet")
+    assert (read.num_episodes, len(read), read.fps) == (1, len(written), 200)
+    for number in range(0, len(written), 50):
+        for key in ("observation.state", "action"):
+            assert read[number][key].tolist() == written[key][number].tolist()
+        assert read[number]["task"] == read.meta.tasks.index[0]
