@@ -5,8 +5,11 @@ from __future__ import annotations
 import hashlib
 import importlib
 import itertools
+import json
+import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -14,7 +17,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper
 
-from companion.cli.main import main
+from companion.cli.main import _normalised, main, make_parser
 from companion.config.loader import load_flight, logged_flight
 from companion.config.policy import PolicyCard
 from companion.control.policy import Network
@@ -23,7 +26,7 @@ from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.gym.environment import FlightEnvironment
 from sitl.gym.export import mark, write_policy
-from tests.support import HOVER, ROOT
+from tests.support import HOVER, ROOT, SHORT_CATCH
 
 STEPS, TICKS = 30, 600
 
@@ -86,6 +89,40 @@ def test_the_example_writes_the_network_that_it_trained(
     np.testing.assert_allclose(action, np.tanh(observation / scales @ layer[0]), atol=1e-5)
     assert min(map(abs, action[:3])) > 0.0
     assert action[3:] == [0.0, 0.0]
+
+
+def test_the_notebook_trains_and_its_commands_are_those_of_the_companion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One generation of two candidates; the flights after it are for who runs the notebook."""
+    plt = pytest.importorskip("matplotlib.pyplot")
+    plt.switch_backend("agg")
+    text = (ROOT / "examples/policy/policy.ipynb").read_text(encoding="utf-8")
+    cells = {cell["id"]: cell for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"}
+    assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells.values())
+    monkeypatch.syspath_prepend(str(ROOT / "examples/policy"))
+    monkeypatch.chdir(tmp_path)
+    train = importlib.import_module("train")
+    for name, small in {"POPULATION": 2, "FLIGHTS": 1, "MISSION": str(SHORT_CATCH)}.items():
+        monkeypatch.setattr(train, name, small)
+    names: dict[str, Any] = {}
+    exec("".join(cells["settings"]["source"]), names)
+    names["MINUTES"] = 0
+    exec("".join(cells["train"]["source"]), names)
+    (generation,) = names["generations"]
+    assert 0.0 < generation.best <= generation.median < 2.0
+    assert [line.get_ydata().tolist() for line in names["axes"].lines] == [
+        [generation.base],
+        [generation.median],
+        [generation.best],
+    ]
+    plt.close(names["figure"])
+    commands = re.findall(r'companion\(f\\"(.*?)\\"', text)
+    assert [command.split()[0] for command in commands] == ["fly", "compare", "robustness", "faults"]
+    for command in commands:
+        words = re.sub(r"{\S*}", "1", command.replace("{law} ", "")).split()
+        assert make_parser().parse_known_args(_normalised(words))[1] == []
+    Network(str(tmp_path / "policy.onnx"))
 
 
 def test_a_mission_finds_the_file_of_its_policy_beside_itself(environment: FlightEnvironment, tmp_path: Path) -> None:
