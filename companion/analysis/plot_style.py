@@ -91,6 +91,10 @@ def dress(ax: Any) -> None:
         label.set_size(9.5)
 
 
+WIDTH_TO_HEIGHT = 2.1
+"""Of the panes of a path, both heights together."""
+
+
 def path_panes(figure: Figure) -> list[tuple[Any, int]]:
     """Return the axes for a path seen from above (y over x) and from the side (z over x), and for each the index of its height."""
     axes = figure.subplots(2, 1, sharex=True)
@@ -98,15 +102,29 @@ def path_panes(figure: Figure) -> list[tuple[Any, int]]:
         dress(ax)
         ax.set_ylabel(f"{name} [m]")
         ax.set_title(title, loc="left", fontsize=10, color=INK)
+        ax.set_aspect("equal")
     axes[1].set_xlabel("x [m]")
     return [(axes[0], 1), (axes[1], 2)]
 
 
-def scale_path(ax: Any, *values: Any) -> None:
-    """Scale the height of a pane to the values. It shows 0.6 m or more, so that noise of millimetres does not look large."""
-    low, high = np.nanmin(values), np.nanmax(values)
-    middle, half = (low + high) / 2, max(0.3, 0.62 * (high - low))
-    ax.set_ylim(middle - half, middle + half)
+def scale_path(panes: Sequence[tuple[Any, int]], *positions_m: Any) -> None:
+    """Give the panes the range and the height that positions need, with one scale for all axes.
+
+    A pane shows 0.6 m or more, so that noise of millimetres does not look large.
+
+    Args:
+        panes: of `path_panes`.
+        positions_m: arrays of shape (N, 3).
+    """
+    every_m = np.concatenate(positions_m)
+    low_m, high_m = np.nanmin(every_m, axis=0), np.nanmax(every_m, axis=0)
+    middle_m, half_m = (low_m + high_m) / 2, np.maximum(0.3, 0.55 * (high_m - low_m))
+    wanted = WIDTH_TO_HEIGHT * (half_m[1] + half_m[2])
+    half_m *= (max(1.0, wanted / half_m[0]), *[max(1.0, half_m[0] / wanted)] * 2)  # fills the figure
+    for ax, row in panes:
+        ax.set_xlim(middle_m[0] - half_m[0], middle_m[0] + half_m[0])
+        ax.set_ylim(middle_m[row] - half_m[row], middle_m[row] + half_m[row])
+    panes[0][0].get_gridspec().set_height_ratios([half_m[row] for _, row in panes])
 
 
 def figure_legend(figure: Figure, title: str, handles: Sequence[Any], names: Sequence[str], columns: int) -> None:

@@ -224,7 +224,7 @@ def _path(log: FlightLog) -> Figure | None:
         ax.plot(flown[:, 0], flown[:, row], color=SERIES[0], lw=1.5, label="flown", zorder=3)
         if caught is not None:
             ax.plot(*flown[caught, [0, row]], "o", ms=7, mfc="white", mec=CATCH, mew=1.8, label="catch", zorder=4)
-        scale_path(ax, flown[:, row], wanted[:, row])
+    scale_path(panes, flown, wanted)
     legend(panes[0][0], columns=3)
     figure.suptitle("Path", fontsize=13, fontweight="bold", color=INK)
     return figure

@@ -6,14 +6,16 @@ import math
 import re
 from collections.abc import Callable
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from msgspec.structs import replace
 
-from companion.analysis import metrics, plots
+from companion.analysis import metrics, plot_style, plots
 from companion.analysis.log import FlightLog
 from companion.analysis.report import write_report
 from companion.analysis.summary import empty_summary, summarise, write_summary
@@ -348,3 +350,19 @@ def test_the_report_of_a_flight_that_hardly_began_is_written_all_the_same(tmp_pa
     assert "aborted" in page
     assert re.findall(r'class="verdict not"><p>(.*?)</p>', page) == ["mocap lost for long"]
     assert "<b>mine</b>" not in page
+
+
+@pytest.mark.parametrize("size_m", [(2.0, 0.02, 1.0), (0.02, 0.02, 1.0), (9.0, 2.0, 1.0), (1.0, 6.0, 3.0)])
+def test_a_path_is_drawn_whole_and_to_one_scale(size_m: tuple[float, float, float]) -> None:
+    figure = plot_style.new_figure(5.2)
+    panes = plot_style.path_panes(figure)
+    corners_m = np.array(list(product((-0.5, 0.5), repeat=3))) * size_m + np.array((1.0, 2.0, 3.0))
+    plot_style.scale_path(panes, corners_m, np.full((1, 3), np.nan))
+    FigureCanvasAgg(figure).draw()
+    for ax, row in panes:
+        pixels = ax.transData.transform(corners_m[:, [0, row]])
+        per_m = np.ptp(pixels, axis=0) / (size_m[0], size_m[row])
+        assert per_m[0] == pytest.approx(per_m[1], rel=1e-6)
+        assert per_m[0] == pytest.approx(np.ptp(panes[0][0].transData.transform([[0, 0], [1, 0]])[:, 0]), rel=1e-6)
+        assert all(ax.bbox.contains(*pixel) for pixel in pixels)
+        assert ax.bbox.width > 0.8 * figure.bbox.width

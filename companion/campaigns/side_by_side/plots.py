@@ -183,20 +183,20 @@ def _path(comparison: Comparison) -> Figure | None:
     if not flights:
         return None
     figure = new_figure(5.6 + 0.2 * ((len(comparison.flights) + 1) // 2))
-    for ax, row in path_panes(figure):
-        seen: list[Array] = []
-        for n, flight in enumerate(comparison.flights):
-            course, colour = flight.course, LINES[n].colour
-            flown = np.where(course.flying[:, None], course.flown_world_m, np.nan)
-            wanted = np.where(course.flying[:, None], course.reference_world_m, np.nan)
+    panes, seen = path_panes(figure), list[Array]()
+    for n, flight in enumerate(comparison.flights):
+        course, colour = flight.course, LINES[n].colour
+        flown = np.where(course.flying[:, None], course.flown_world_m, np.nan)
+        wanted = np.where(course.flying[:, None], course.reference_world_m, np.nan)
+        for ax, row in panes:
             ax.plot(wanted[:, 0], wanted[:, row], color="#b7c0c8", lw=3.0, zorder=2, solid_capstyle="round")
             ax.plot(flown[:, 0], flown[:, row], **_style(n), lw=1.35, zorder=3 + 0.1 * n)
             if course.catch is not None:
                 ax.plot(*flown[course.catch, [0, row]], "o", ms=7, mfc="white", mec=colour, mew=1.8, zorder=5)
             if not flight.completed:
                 mark_end(ax, flown[:, 0], flown[:, row], colour)
-            seen += [flown[:, row], wanted[:, row]]
-        scale_path(ax, np.concatenate(seen))
+        seen += [flown, wanted]
+    scale_path(panes, *seen)
     _title(figure, comparison, "Path")
     return figure
 
