@@ -36,7 +36,7 @@ SCALES = {
 """Quantities that the policy uses, and their normalisation; the weights of the others are 0."""
 PARAMETERS = 2 * len(SCALES)
 """x and y share their weights, because the room has no preferred direction; the joint torques stay those of the base law."""
-POPULATION, FLIGHTS = 8, 6
+POPULATION, FLIGHTS = 8, 3
 """Candidates of a generation, and laboratories in which each of them flies, the same for all."""
 HELD_OUT = 500_000
 """Training draws laboratories below this number."""
