@@ -145,17 +145,18 @@ def wanted(law: str) -> dict[str, Array]:
 
 def table(laws: Mapping[str, tuple[dict[str, Array], dict[str, Array]]]) -> str:
     """Return measured compliances, and in brackets their ratio to the wanted ones, as a Markdown table."""
-    heads = [f"{pane}, {hz:g} Hz" for pane in PANES for hz in TABLE_HZ]
-    lines = ["| law/preset | " + " | ".join(heads) + " |", "|---" * (1 + len(heads)) + "|"]
-    for law, (flown, asked) in laws.items():
-        cells = []
-        for pane in PANES:
-            for hz in TABLE_HZ:
-                at = int(np.argmin(np.abs(FREQUENCIES_HZ - hz)))
-                size = flown[pane][at] * (1e3 if pane == PANES[0] else 1.0)
+    lines = [
+        "| | law/preset | " + " | ".join(f"{hz:g} Hz" for hz in TABLE_HZ) + " |",
+        "|---" * (2 + len(TABLE_HZ)) + "|",
+    ]
+    for pane in PANES:
+        scale, unit = (1e3, "mm/N") if pane == PANES[0] else (1.0, "rad/(N m)")
+        for law, (flown, asked) in laws.items():
+            cells = []
+            for at in [int(np.argmin(np.abs(FREQUENCIES_HZ - hz))) for hz in TABLE_HZ]:
                 ratio = f" ({flown[pane][at] / asked[pane][at]:.2f})" if pane in asked else ""
-                cells.append(f"{size:.2f}{ratio}")
-        lines.append(f"| {law} | " + " | ".join(cells) + " |")
+                cells.append(f"{scale * flown[pane][at]:.3g}{ratio}")
+            lines.append(f"| {pane}, {unit} | {law} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
