@@ -245,7 +245,7 @@ def main(argv: list[str] | None = None) -> int:
         served = _serve(members, arguments.for_launcher, arguments.speed)
         with asyncio.Runner(loop_factory=LockstepLoop if arguments.time else fine_loop) as runner:
             runner.run(served)
-    except (OSError, LinkError, FaultError, Px4Error) as error:
+    except (OSError, LinkError, FaultError, Px4Error, FloatingPointError) as error:
         text = f"sitl: {error}"
         if arguments.for_launcher:
             for channel in channels:

@@ -38,7 +38,8 @@ def add_parser(commands: Any) -> None:
         type=names,
         default=(),
         metavar="LAW|FILE,...",
-        help=f"control laws, and files: *.yaml of companion tune, *.onnx (default: the presets of {','.join(law for law in PRESETS if PRESETS[law])})",
+        help="control laws, and files: *.yaml of companion tune, *.onnx "
+        f"(default: the presets of {','.join(law for law in PRESETS if PRESETS[law])})",
     )
     parser.add_argument(
         "--presets", type=names, default=(), metavar="NAME,...", help="default: all presets of each law"

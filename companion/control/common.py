@@ -20,13 +20,11 @@ from companion.control.thrust import (
 )
 from companion.control.types import PlantState, Wrench
 from companion.model.algebra import minus
-from companion.model.constants import GRAVITY_M_S2
+from companion.model.constants import GRAVITY_M_S2, PX4_YAW_P
 from companion.model.frames import quat_multiply, wrap_rad
 from companion.model.outputs import ControlLog
 from companion.model.types import IDENTITY_QUAT, Chi, Joints, Quat, Reference, Vec3
 
-PX4_YAW_P: Final = 2.8
-"""Rate of yaw at which PX4 turns, for each rad of its error, 1/s: the default of MC_YAW_P."""
 YAW_LEAD_MAX_RAD: Final = 0.5
 """Largest lead of the yaw setpoint, that of 80 deg/s: a phase that states its rate in other units does not spin the vehicle."""
 

@@ -15,3 +15,6 @@ TICK_PERIOD_S: Final = 0.005
 
 GRADED_POSE_MAX_AGE_S = 0.1
 """Maximum age at which telemetry and log analysis still compare a motion-capture pose with the reference."""
+
+PX4_YAW_P: Final = 2.8
+"""Rate of yaw at which PX4 turns, for each rad of its error, 1/s: the default of MC_YAW_P."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Level
-from companion.model.constants import GRAVITY_M_S2
+from companion.model.constants import GRAVITY_M_S2, PX4_YAW_P
 from companion.model.flight_stage import SPOOL_S
 from companion.px4.wanted import Value, Wanted
 
@@ -145,6 +145,16 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "error doubles (3.0 instead of 1.6 deg in the catch)",
             _WARN,
             limits=(150.0, 1000.0),
+        ),
+        Wanted(
+            "MC_YAW_P",
+            PX4_YAW_P,
+            "rate of yaw for each rad of its error, 1/s; the yaw setpoint leads by as much as PX4 would lag behind with 2.8, so "
+            "that with another value a vehicle that turns is off by a part of that",
+            _WARN,
+            limits=(2.2, 3.6),
+            fix="set MC_YAW_P to 2.8, PX4's default, unless yaw swings with it",
+            file=False,
         ),
     ),
     "Loss of the companion": (

@@ -53,6 +53,9 @@ class Scene:
 
         Args:
             airborne: whether a payload may be thrown.
+
+        Raises:
+            FloatingPointError: the world has become unstable.
         """
         bag = self.payload.bag
         if bag is None:
@@ -60,6 +63,10 @@ class Scene:
             mujoco.mj_step(self.model, self.data)
         elif bag.step(self.machines[0].q, self.t_s):
             self._events.report(self.t_s, "bounced_out")
+        if self.data.time <= self.t_s:  # MuJoCo begins again when an acceleration is no number
+            raise FloatingPointError(
+                f"the simulated world became unstable at {self.t_s:.3f} s: acceleration without bound"
+            )
         self.t_s = t_s = self.data.time
         for machine in self.machines:
             machine.read()

@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import shutil
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import AsyncExitStack, contextmanager
@@ -26,7 +27,7 @@ from companion.model.exit_codes import EXIT_OK
 from companion.preflight import arm as preflight
 from companion.preflight.observe import observe
 from companion.runtime.clock import flight_clock
-from companion.runtime.realtime import WORLD_PRIORITY
+from companion.runtime.realtime import GIL_SWITCH_S, WORLD_PRIORITY
 from companion.sitl_config.loader import load_sitl
 from sitl.servo.bus import ServoBus
 from sitl.servo.from_config import plugged_in, servos_of
@@ -150,7 +151,8 @@ def served(bus: ServoBus) -> Iterator[str]:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(WORLD_PRIORITY))
         loop.run_forever()
 
-    thread = threading.Thread(target=serve, name="bench")
+    thread, interval_s = threading.Thread(target=serve, name="bench"), sys.getswitchinterval()
+    sys.setswitchinterval(GIL_SWITCH_S)
     thread.start()
     try:
         asyncio.run_coroutine_threadsafe(bus.__aenter__(), loop).result()
@@ -162,6 +164,7 @@ def served(bus: ServoBus) -> Iterator[str]:
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
         loop.close()
+        sys.setswitchinterval(interval_s)
 
 
 def _copy(folder: Path) -> Path:

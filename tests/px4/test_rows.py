@@ -59,7 +59,7 @@ def vehicle(*overrides: str) -> Vehicle:
 
 
 def good() -> dict[str, float | int]:
-    return {**simulated_values(), HOVER: 0.49, ROTOR_COUNT: 4, **geometry_of(vehicle().airframe)}
+    return {**simulated_values(), HOVER: 0.49, ROTOR_COUNT: 4, "MC_YAW_P": 2.8, **geometry_of(vehicle().airframe)}
 
 
 def wrong(params: dict[str, float | int], machine: Vehicle | None = None) -> list[Row]:

@@ -71,7 +71,10 @@ class Bag:
         vx, vy, vz = velocity
         above = z > 0.0
         if above is not self._above:
-            self._cross(x, y, above, t_s)
+            if self.side == 0 and abs(z) > self._hoop_m:
+                self._above = above  # it crossed the plane before it came near
+            else:
+                self._cross(x, y, above, t_s)
         elif self.bounced:
             self.bounced = False
         fx = fy = fz = 0.0

@@ -173,6 +173,14 @@ def test_a_payload_that_settles_off_centre_turns_the_force_sensor() -> None:
     assert truth.torque_sensor_nm[1] == pytest.approx(weight_n * lever_x_m, rel=0.05)
 
 
+def test_a_payload_that_comes_near_behind_the_hoop_is_not_in_the_bag() -> None:
+    bag = Bag(Net(on=True), HOOP_M, PAYLOAD_RADIUS_M)
+    assert [bag.force_n((0.02, 0.0, z), (0.0, 0.0, 2.0), 0.0) for z in (-0.99, -0.5, -0.11)] == [None] * 3
+    assert bag.side == 0
+    bag.force_n((0.02, 0.0, 0.001), (0.0, 0.0, 2.0), 0.0)
+    assert bag.side == -1, "it lifts the mesh from below"
+
+
 def test_what_bounces_out_is_an_event_and_no_catch() -> None:
     config = WorldConfig(payload_kg=0.1, net=Net(on=True))
     world = world_with(config)

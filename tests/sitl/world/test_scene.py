@@ -102,3 +102,11 @@ def test_a_machine_flies_beside_a_distant_one_as_it_does_alone(number: int) -> N
     both = fly([away, mine] if number else [mine, away], 2.5)[number]
     apart = list(map(difference, alone, both))
     assert max(apart) < AGREE
+
+
+def test_an_unstable_world_ends_with_an_error_and_does_not_begin_again() -> None:
+    scene = Scene([spec(VEHICLE, World(), 0.0)])
+    scene.step()
+    scene.data.qvel[0] = math.inf
+    with pytest.raises(FloatingPointError, match=r"^the simulated world became unstable at 0\.002 s"):
+        scene.step()
