@@ -116,7 +116,7 @@ class Clearance:
         # Through the middle, where there are no blades: the distance depends on how steeply it passes the ring's inner edge.
         flat = math.sqrt(flat_2)
         if flat < 1e-6:
-            return self._to_edge_m if dz > 0.0 else inner - off
+            return off - outer if dz > 0.0 else inner - off
         in_s = (math.sqrt(b * b - flat_2 * self._past_inner_m2) - b) / flat_2
         return min(self._to_edge_m, (-pz - max(in_s * dz, out_s * dz)) * flat)
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from functools import cache
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,7 +15,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.algebra import plus
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.outputs import TetherState
-from companion.model.types import Joints, Quat, Vec3
+from companion.model.types import Joints, Quat, Vec2, Vec3
 from companion.safety.stop import StopModel
 from companion.safety.tether import TetherWatch
 from companion.safety.tether_pull import PullEstimate
@@ -88,7 +89,6 @@ def test_used_up_is_taut_and_far_beyond_is_separated() -> None:
     assert not gone.snagged
 
 
-TIED = ("vehicle.tether.attachment_body_m=[0.02, -0.13, 0.05]", "vehicle.tether.anchor_world_m=[0.4, -0.7, 0.2]")
 degree = st.floats(-25.0, 25.0)
 
 
@@ -96,9 +96,13 @@ degree = st.floats(-25.0, 25.0)
     st.tuples(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(0.4, 2.0)),
     st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
     st.tuples(degree, degree, st.floats(-180.0, 180.0)),
+    st.sampled_from([(0.02, -0.13, 0.05), (0.3, -0.1, -0.05)]),
 )
-def test_any_pose_gives_the_state_of_a_line_from_the_anchor_to_where_it_is_tied(p: Vec3, v: Vec3, deg: Vec3) -> None:
-    machine, tied, anchor = vehicle(*TIED), (0.02, -0.13, 0.05), (0.4, -0.7, 0.2)
+def test_any_pose_gives_the_state_of_a_line_from_the_anchor_to_where_it_is_tied(
+    p: Vec3, v: Vec3, deg: Vec3, tied: Vec3
+) -> None:
+    anchor = (0.4, -0.7, 0.2)
+    machine = vehicle(f"vehicle.tether.attachment_body_m={list(tied)}", f"vehicle.tether.anchor_world_m={list(anchor)}")
     q = quat_from_euler_zyx(*map(math.radians, deg))
     back = (q[0], -q[1], -q[2], -q[3])
     state = watch_of(machine).update(0.0, p, v, q, FOLDED, None, None)
@@ -189,6 +193,52 @@ def test_clearance_of_the_rotors_against_brute_force(azimuth: float, elevation: 
         assert found <= true + 6.5e-3, "it must not promise more room than there is"
     if through_the_middle:
         assert found >= true - 0.11
+
+
+def sampled_clearance_m(machine: Vehicle, tied: Vec3, rays: list[Vec3]) -> float:
+    """The smallest distance of points along the lines from the rotors' plane, over or under the disk, and from the arm's plane."""
+    outer, inner, net_m = machine.airframe.radius_m, tether_of(machine).rotor_inner_radius_m, machine.tip_radius_m
+    (px, py, pz), found = tied, []
+    side = -1.0 if pz <= 0.0 else 1.0
+    for number, (dx, dy, dz) in enumerate(rays):
+        flat = math.hypot(dx, dy)
+        s = np.arange(0.0, 1.3, 5e-4) / flat if flat > 0.0 else np.arange(0.0, 1.0001, 5e-4)
+        beside, r = side * (pz + s * dz), np.hypot(px + s * dx, py + s * dy)
+        if number != (len(rays) - 1 if side > 0.0 else 0):
+            pass  # tied below, the straight line comes nearest to the rotors, tied above, the one that hangs deepest
+        elif r[0] >= inner:
+            found.append(min(beside[r <= outer]) if min(r) <= outer else min(r) - outer)
+        elif flat > 0.0:
+            found += [math.hypot(inner - r[0], pz), flat * min(beside[(inner <= r) & (r <= outer)])]
+        else:
+            found.append(r[0] - outer if side * dz < 0.0 else inner - r[0])
+        if clearance(machine).judges_arm:  # a slab about the shoulder, which is 0.05 m below the origin
+            reach_m, s = sum(machine.arm.link_lengths_m) + net_m, np.arange(0.0, 8.0, 5e-4)
+            away, y = np.hypot(px + s * dx, pz + 0.05 + s * dz) - reach_m, py + s * dy
+            within = np.abs(y) <= net_m
+            found.append(min(away[within]) if any(within) else max(abs(py) - net_m, away[0]))
+    return float(min(found))
+
+
+AROUND = [math.radians(deg) for deg in range(5, 365, 30)]
+RAYS: list[Vec3] = [
+    (math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e))
+    for e in (-1.2, -0.5, 0.0, 0.4, 1.1)
+    for a in AROUND
+]
+
+
+@pytest.mark.parametrize("height_m", [-0.07, 0.07, 0.0])
+@pytest.mark.parametrize("place", [(0.05, 0.0), (0.08, -0.11), (0.0, 0.3), (0.3, -0.2), (0.6, 0.12), (-0.3, -0.6)])
+def test_the_clearance_is_that_of_points_along_the_line(place: Vec2, height_m: float) -> None:
+    tied = (*place, height_m)
+    machine = vehicle(f"vehicle.tether.attachment_body_m={list(tied)}")
+    judge = clearance(machine)
+    for k, ray in enumerate([*RAYS, (0.0, 0.0, 1.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)]):
+        hanging = None if k % 3 == 0 else RAYS[(7 * k) % len(RAYS)]
+        true_m = sampled_clearance_m(machine, tied, [ray] if hanging is None else [ray, hanging])
+        assert judge.least_m(ray, hanging, None) == pytest.approx(true_m, abs=2e-3), (ray, hanging)
+        assert judge.needs_hanging or true_m == sampled_clearance_m(machine, tied, [ray])
 
 
 @pytest.mark.parametrize("elbow_deg", [0.0, 60.0, 140.0, 180.0])
@@ -352,6 +402,12 @@ def test_a_pull_comes_through_its_filter_and_counts_after_its_time_and_from_its_
     assert first == pytest.approx(beyond - 2 + tether.pull_time_s / DT_S, abs=2.0)
 
 
+def test_at_the_anchor_a_pull_has_no_direction() -> None:
+    watch, force = watch_of(vehicle()), (0.0, 50.0, 0.0)
+    states = [watch.update(k * DT_S, (0.0, -1.2 - 5e-7, 0.0), STILL, LEVEL, FOLDED, force, None) for k in range(3)]
+    assert [state.pull_n for state in states] == [0.0, 0.0, 0.0]
+
+
 @pytest.mark.parametrize(("gap_s", "counts_s"), [(0.03, 0.03), (1.0, 0.05), (-0.1, 0.0)])
 def test_a_gap_between_two_ticks_counts_as_50_ms_at_most(gap_s: float, counts_s: float) -> None:
     watch, p = watch_of(vehicle()), (0.5, 0.0, 1.0)
@@ -361,9 +417,17 @@ def test_a_gap_between_two_ticks_counts_as_50_ms_at_most(gap_s: float, counts_s:
     assert state.pull_n == pytest.approx(5.0 * counts_s / (tether_of(vehicle()).pull_filter_s + counts_s))
 
 
-@pytest.mark.parametrize(("size_n", "held"), [(5.9, False), (7.0, True)])
-def test_six_newtons_from_the_side_are_something_that_holds_the_vehicle(size_n: float, held: bool) -> None:
-    states = pulled(6.0, lambda t_s, p: (0.6 * size_n, 0.8 * size_n, 0.0))
+@pytest.mark.parametrize(
+    ("size_n", "later_n", "held"), [(5.9, 5.9, False), (7.0, 7.0, True), (7.0, 4.0, True), (7.0, 3.3, False)]
+)
+def test_six_newtons_from_the_side_hold_the_vehicle_until_they_fall_below_3_6_newtons(
+    size_n: float, later_n: float, held: bool
+) -> None:
+    def force(t_s: float, p: Vec3) -> Vec3:
+        now_n = size_n if t_s < 2.0 else later_n
+        return (0.6 * now_n, 0.8 * now_n, 0.0)
+
+    states = pulled(6.0, force)
     assert states[-1].snagged is held
     assert states[-1].pull_n == 0.0, "away from the anchor"
     first = next(k for k, state in enumerate(pulled(2.0, lambda t_s, p: (60.0, 80.0, 0.0))) if state.snagged)
