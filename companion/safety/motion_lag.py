@@ -37,12 +37,12 @@ class MotionLag:
         """Update with a new position and a new pose.
 
         Args:
-            dt_s: time since the last update.
+            dt_s: time since the last update, more than 0.
             offset_m: PX4's position minus that of motion capture.
             velocity_m_s: PX4's velocity, same frame.
         """
         self._since_s = min(WINDOW_S, self._since_s + dt_s)
-        gain = dt_s / self._since_s if self._since_s > 0.0 else 0.0
+        gain = dt_s / self._since_s
         d_m, d_m_s = minus(offset_m, self._mean_m), minus(velocity_m_s, self._mean_m_s)
         self._mean_m, self._mean_m_s = plus(self._mean_m, scaled(d_m, gain)), plus(self._mean_m_s, scaled(d_m_s, gain))
         keep = 1.0 - gain

@@ -235,6 +235,23 @@ def test_nothing_is_asked_against_a_pilot_for_as_long_as_they_fly() -> None:
     assert landing.step(seen(700.0, 0.3, mode=FlightMode.MANUAL, armed=False)).ended
 
 
+@pytest.mark.parametrize(
+    ("before", "mode", "request_"),
+    [
+        (FlightMode.OFFBOARD, FlightMode.MANUAL, AutopilotRequest.NONE),
+        (FlightMode.OFFBOARD, FlightMode.HOLD, AutopilotRequest.LAND),  # perhaps its mode before the landing
+        (FlightMode.LAND, FlightMode.HOLD, AutopilotRequest.NONE),
+        (FlightMode.LAND, FlightMode.LAND, AutopilotRequest.LAND),
+    ],
+)
+def test_nothing_is_asked_once_a_pilot_has_chosen_a_mode(
+    before: FlightMode, mode: FlightMode, request_: AutopilotRequest
+) -> None:
+    landing = Landing(pilot=False)
+    assert landing.step(seen(0.1, 1.0, mode=before)).request is AutopilotRequest.LAND
+    assert landing.step(seen(0.2, 1.0, mode=mode)).request is request_
+
+
 def test_a_silent_px4_that_stands_is_landed_and_one_in_the_air_is_not() -> None:
     landing = Landing(pilot=False)
     steps = [landing.step(seen(4.0 + k * 0.05, 0.31, heard_s=0.0)) for k in range(80)]

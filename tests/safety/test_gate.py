@@ -54,22 +54,34 @@ def test_a_good_setpoint_leaves_as_it_is(vehicle: Vehicle) -> None:
 
 
 @pytest.mark.parametrize(
-    ("torque", "angle", "fresh", "leaves"),
+    ("torque", "angle", "fresh", "limp"),
     [
-        ((NAN, 0.0), (2.0, 1.0), True, None),
-        ((0.0, math.inf), (2.0, 1.0), True, None),
-        ((0.5, 0.5), None, True, None),
-        ((0.5, 0.5), (2.0, 1.0), False, None),
-        ((99.0, -99.0), (2.0, 1.0), True, (2.5, -2.5)),
-        ((1.0, 1.0), (math.radians(176), 1.0), True, (0.0, 1.0)),  # past the upper wall of joint 1
-        ((-1.0, 1.0), (math.radians(176), 1.0), True, (-1.0, 1.0)),
-        ((0.2, -1.0), (2.0, math.radians(-11)), True, (0.2, 0.0)),  # past the lower wall of joint 2
+        ((NAN, 0.0), (2.0, 1.0), True, True),
+        ((0.0, math.inf), (2.0, 1.0), True, True),
+        ((0.5,), (2.0, 1.0), True, True),
+        ((0.5, 0.5), None, True, False),
+        ((0.5, 0.5), (2.0, 1.0), False, False),
     ],
 )
-def test_joint_torques(
-    vehicle: Vehicle, torque: Joints, angle: Joints | None, fresh: bool, leaves: Joints | None
+def test_unusable_torques_leave_the_arm_limp_and_a_stale_joint_state_does_not(
+    torque: Joints, angle: Joints | None, fresh: bool, limp: bool
 ) -> None:
-    assert Gate(vehicle).check(None, torque, angle, fresh).arm_torque_nm == leaves
+    verdict = Gate(VEHICLE).check(None, torque, angle, fresh)
+    assert verdict.arm_torque_nm is None
+    assert [refusal.limp for refusal in verdict.refused] == [limp]
+
+
+@pytest.mark.parametrize(
+    ("torque", "angle", "leaves"),
+    [
+        ((99.0, -99.0), (2.0, 1.0), (2.5, -2.5)),
+        ((1.0, 1.0), (math.radians(176), 1.0), (0.0, 1.0)),  # past the upper wall of joint 1
+        ((-1.0, 1.0), (math.radians(176), 1.0), (-1.0, 1.0)),
+        ((0.2, -1.0), (2.0, math.radians(-11)), (0.2, 0.0)),  # past the lower wall of joint 2
+    ],
+)
+def test_joint_torques(vehicle: Vehicle, torque: Joints, angle: Joints, leaves: Joints) -> None:
+    assert Gate(vehicle).check(None, torque, angle, True).arm_torque_nm == leaves
 
 
 @pytest.mark.parametrize(

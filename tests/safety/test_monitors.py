@@ -12,6 +12,7 @@ from companion.safety.arm import error_text
 from companion.safety.flight_context import FlightContext
 from companion.safety.monitors import Monitors
 from companion.safety.oscillation import Oscillation
+from companion.safety.validity import InputFilter
 from tests.safety.faults import (
     EXTERNAL,
     NAN,
@@ -77,6 +78,19 @@ def test_a_value_that_is_not_finite_is_reported_and_its_record_counts_as_missing
         good = healthy(3)
         assert monitors.check(good, flying()) == ()
         assert monitors.trusted is good
+
+
+@pytest.mark.parametrize(
+    ("part", "names"),
+    [
+        ("vehicle", ("boot_s", "imu_boot_s", "delta_velocity_body_m_s")),
+        ("status", ("battery_stamp_s", "battery_voltage_v", "battery_remaining")),
+        ("mocap", ("latency_s", "exposure_server_s", "marker_error_m")),
+    ],
+)
+def test_a_record_without_an_optional_value_is_valid(part: str, names: tuple[str, ...]) -> None:
+    without = put(part, **dict.fromkeys(names))(healthy())
+    assert InputFilter().clean(without) is without
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.types import Inputs, SafetyAction, Severity
 from companion.safety.flight_context import FlightContext
 from companion.safety.monitors import Monitors
-from companion.safety.rule import Rule
+from companion.safety.rule import Lamp, Rule
 from companion.safety.rules import RULES
 from tests.safety.faults import EXTERNAL, FAULTS, FOUND, RULE, VEHICLE, Fault, replace, seen_by, turned
 from tests.safety.healthy import START_S, TICK_S, after_a_moment, fed_by_another, flying, healthy, standing, watched
@@ -162,6 +162,11 @@ def until_told(rule: Rule) -> tuple[Vehicle, list[Inputs]]:
 def test_every_rule_has_its_fault() -> None:
     assert set(FAULTS) == set(RULE) == set(REQUIRED)
     assert len(RULES) == len(RULE), "an id twice"
+
+
+def test_a_rule_is_shown_on_the_lamp_of_its_subject_or_its_own() -> None:
+    found = [RULE[id_].lamp for id_ in ("arm_lost", "mocap_lost", "vision_lost", "recorder_drops", "battery_low")]
+    assert found == [Lamp.ARM, Lamp.MOCAP, Lamp.ESTIMATE, Lamp.RECORDER, Lamp.BATTERY]
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.id)

@@ -126,6 +126,15 @@ def test_a_vehicle_that_sinks_again_gets_its_thrust_back_at_once() -> None:
     assert evidence.relief == 1.0
 
 
+def test_thrust_is_not_reduced_before_motion_capture_has_measured_the_descent() -> None:
+    evidence = Touchdown.begin(CLEARANCE_M)
+    for k in range(40):
+        t_s = k * STEP_S
+        pose = pose_at(t_s, CLEARANCE_M) if k == 39 else None
+        evidence = evidence.update(t_s, vehicle_at(CLEARANCE_M), pose, 0.0, 1.0, False)
+    assert evidence.height.stands(t_s) and evidence.alone_since_s is None
+
+
 def test_the_descent_is_measured_over_the_last_0_15_s_of_poses() -> None:
     sinking = Sinking()
     for k in range(100):
