@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from companion.core.flight_state import FlightState
-from companion.core.let_go import let_go_if_better
+from companion.core.let_go import let_go_if_better, team_state_of
 from companion.core.transition import Parameters, Transition
 from companion.mission.air import HeldBar, Observation
 from companion.model.flight_stage import Stage
@@ -114,3 +114,22 @@ def test_a_vehicle_that_px4_lands_lets_go_when_the_feet_are_low() -> None:
     landing = state(stage=Stage.AUTOPILOT_LAND)
     assert not let_go(after(landing, 0.96, said()))
     assert let_go(after(landing, 0.93, said()))
+
+
+@pytest.mark.parametrize(
+    ("aborting", "action", "announced"),
+    [
+        (False, SafetyAction.WARN, (False, False)),
+        (False, SafetyAction.HOLD, (True, False)),
+        (True, SafetyAction.RETRACT, (True, False)),
+        (True, SafetyAction.LAND, (True, True)),
+        (False, SafetyAction.LAND, (True, False)),
+    ],
+)
+def test_a_hold_and_an_aborted_flight_that_lands_are_announced(
+    aborting: bool, action: SafetyAction, announced: tuple[bool, bool]
+) -> None:
+    held = state(aborting=aborting, supervisor=SupervisorState(action, "cause", T_S))
+    found = team_state_of(held, inputs(1.3, None))
+    assert (found.holds, found.lands, found.position_world_m) == (*announced, (0.0, 0.0, 1.3))
+    assert team_state_of(held, replace(inputs(1.3, None), vehicle=None, mocap=None)).server_s is None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,12 +16,14 @@ from companion.core.flight_state import FlightState, Request
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters
 from companion.mission.active_plan import ActiveTrajectory
-from companion.mission.air import Observation
+from companion.mission.air import NOTHING, Air, Expectation, Observation
 from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
 from companion.mission.reference import at_rest
+from companion.model.algebra import plus
 from companion.model.flight_stage import Stage
 from companion.model.outputs import TetherState
+from companion.model.team import Grip
 from companion.model.types import (
     AutopilotRequest,
     Event,
@@ -257,3 +261,126 @@ def test_armed_by_others_a_flip_is_not_taken_as_known_from_before() -> None:
     state = replace(P.initial_state(), entered_s=healthy().t_s)
     _, request = after(state, "armed_externally", SafetyAction.AUTOPILOT_LAND, armed_by_others=True, inputs=i)
     assert request.autopilot is AutopilotRequest.LAND
+
+
+def held_by(cause: str, **fields: Any) -> FlightState:
+    """In a hold of the mission's plan."""
+    state, since_s = in_plan(), healthy().t_s - 5.0
+    assert state.course is not None
+    supervisor = SupervisorState(SafetyAction.HOLD, cause, since_s)
+    return replace(state, **({"supervisor": supervisor, "course": state.course.hold(since_s)} | fields))
+
+
+@pytest.mark.parametrize(("standing", "cause"), [(None, "partner_holds"), ("too little tether left", "operator_hold")])
+def test_a_resume_with_a_bar_waits_for_the_other_vehicle(standing: str | None, cause: str) -> None:
+    held = held_by("operator_hold", grip=Grip.CARRYING)
+    state, request = after(held, "operator_resume", SafetyAction.NOMINAL, standing=standing)
+    assert (state.supervisor.action, state.supervisor.cause) == (SafetyAction.HOLD, cause)
+    assert ("resume_refused" in ids(request)) is (standing is not None)
+    assert not request.resumed
+
+
+@pytest.mark.parametrize(
+    ("event_id", "action", "cause"),
+    [
+        ("too_fast", SafetyAction.HOLD, "too_fast"),
+        ("partner_holds", SafetyAction.HOLD, "partner_holds"),
+        ("force_lost", SafetyAction.WARN, "partner_holds"),
+    ],
+)
+def test_a_vehicle_that_holds_for_the_other_and_finds_a_reason_of_its_own_is_held_by_that(
+    event_id: str, action: SafetyAction, cause: str
+) -> None:
+    assert after(held_by("partner_holds"), event_id, action)[0].supervisor.cause == cause
+
+
+def test_a_resume_without_a_hold_changes_nothing() -> None:
+    for grip in (Grip.FREE, Grip.CARRYING):
+        before = in_plan(grip=grip)
+        for standing in (None, "too little tether left"):
+            state, request = after(before, "operator_resume", SafetyAction.NOMINAL, standing=standing)
+            assert ids(request) == ["operator_resume"] and not request.resumed
+            assert (state.supervisor, state.course) == (before.supervisor, before.course)
+
+
+def test_a_landing_in_front_of_a_surface_first_moves_back_from_it() -> None:
+    back_m = (0.1, -0.15, 0.2)
+    state, _ = after(in_plan(expected=Expectation(back_m=back_m)), "arm_lost", SafetyAction.LAND)
+    assert state.course is not None
+    plan = state.course.plan
+    places = [plan.reference(k * 0.01).position_world_m for k in range(round(100 * plan.duration_s))]
+    assert min(math.dist(place, plus(HERE, back_m)) for place in places) < 0.01
+
+
+def test_a_landing_goes_on_without_px4s_state() -> None:
+    landing = next(segment for segment in PLAN.segments if segment.kind is PhaseKind.LANDING)
+    before = in_plan(landing.start_s + 0.1)
+    assert tick(before, inputs=replace(healthy(), vehicle=None))[0].touchdown is before.touchdown
+
+
+class Probe(SimpleNamespace):
+    """A phase that shows what it is given; its state is an empty expectation."""
+
+    title, acts, ends, fails = "probe", True, False, False
+
+    def begin(self, air: Air) -> Expectation | None:
+        return None if self.ends else self.step(air, NOTHING)
+
+    def step(self, air: Air, own: Expectation) -> Expectation | None:
+        if self.fails:
+            raise ValueError("boom")
+        self.seen = (air.nominal, air.holds, air.waits)
+        return None if self.ends else own
+
+    def leave(self, own: Expectation, t_s: float) -> Expectation | None:
+        return self.step(self.air, own) if self.fails else None if self.ends else own
+
+    def expects(self, own: Expectation) -> Expectation:
+        return own
+
+
+def probed(probe: Probe) -> Parameters:
+    return dataclasses.replace(P, phases=(probe,) * len(P.phases), acts=True)  # type: ignore[arg-type]
+
+
+ENGAGED = PLAN.segment(6.0)
+
+
+@pytest.mark.parametrize(
+    ("action", "cause", "standing", "seen"),
+    [
+        (SafetyAction.NOMINAL, None, None, (True, False, False)),
+        (SafetyAction.WARN, "force_lost", None, (False, False, False)),
+        (SafetyAction.HOLD, "too_fast", None, (False, True, False)),
+        (SafetyAction.HOLD, "partner_holds", None, (False, True, True)),
+        (SafetyAction.HOLD, "partner_holds", "a rule", (False, True, False)),
+    ],
+)
+def test_a_phase_sees_whether_the_flight_holds_and_waits(
+    action: SafetyAction, cause: str | None, standing: str | None, seen: tuple[bool, bool, bool]
+) -> None:
+    probe = Probe()
+    held = held_by("", supervisor=SupervisorState(action, cause, healthy().t_s), own=NOTHING, engaged=ENGAGED)
+    assert tick(held, parameters=probed(probe), standing=standing)[0].own is NOTHING
+    assert probe.seen == seen
+
+
+@pytest.mark.parametrize("own", [None, NOTHING])
+def test_a_phase_that_is_over_or_does_not_begin_moves_the_plan_to_its_end(own: Expectation | None) -> None:
+    before = in_plan(own=own, engaged=None if own is None else ENGAGED)
+    state, _ = tick(before, parameters=probed(Probe(ends=True)))
+    assert state.course is not None and (state.own, state.skips) == (None, False)
+    assert state.course.pace(healthy().t_s)[0] == pytest.approx(ENGAGED.end_s)
+
+
+@pytest.mark.parametrize("ends", [False, True])
+def test_a_hold_lets_the_phase_leave_what_it_does(ends: bool) -> None:
+    before = in_plan(own=NOTHING, engaged=ENGAGED)
+    state, _ = after(before, "too_fast", SafetyAction.HOLD, parameters=probed(Probe(ends=ends)))
+    assert (state.own, state.skips) == ((None, True) if ends else (NOTHING, False))
+
+
+def test_a_phase_that_raises_an_error_is_named_with_the_place_of_it() -> None:
+    _, request = tick(in_plan(own=NOTHING, engaged=ENGAGED), parameters=probed(Probe(fails=True)))
+    (text,) = [event.text for event in request.events if event.id == "phase_failed"]
+    assert re.fullmatch(r"phase 'probe' failed: .*boom.* \(test_reactions\.py:\d+\)", text)
