@@ -94,12 +94,9 @@ class Guardian:
             _log_line(
                 f"heard {received.count} heartbeats, {received.missed} missed, silent for {silent_ms:.0f} ms at most in the air"
             )
-            if self._mocap is not None:
-                self._mocap.close()
-            if self._team is not None:
-                self._team.close()
-            if self._heartbeats.recorder is not None:
-                self._heartbeats.recorder.close()
+            for opened in (self._mocap, self._team, received.recorder):
+                if opened is not None:
+                    opened.close()
 
     # -- standby ---------------------------------------------------------------------------------------------------
 

@@ -8,12 +8,13 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.guardian.flight_process import HeartbeatReceiver
+from companion.guardian.flight_process import FlightProcess, HeartbeatReceiver
 from companion.guardian.heartbeat import MAX_BYTES, PROBLEM, READY
 from companion.guardian.process import main
 from companion.launcher.guardian_process import outcome_of
@@ -52,6 +53,17 @@ def test_ticks_that_it_did_not_hear_of_are_counted(tmp_path: Path) -> None:
         rig.beat(goodbye=True)
         assert rig.guardian.wait(DEADLINE_S) == 0
         assert rig.log.read_text().startswith(f"heard {rig.tick - 3} heartbeats, 3 missed, ")
+
+
+def test_the_end_of_the_flight_process_is_awaited_for_the_time_given() -> None:
+    with subprocess.Popen(["sleep", "60"]) as process:
+        flight, begin_s = FlightProcess(os.pidfd_open(process.pid)), time.monotonic()
+        assert not flight.wait(0.05) and not flight.watch(0.05)
+        assert time.monotonic() - begin_s >= 0.1
+        flight.kill()
+        assert flight.wait(DEADLINE_S) and flight.watch(DEADLINE_S)
+        os.close(flight.pidfd)
+    assert time.monotonic() - begin_s < DEADLINE_S
 
 
 @pytest.mark.parametrize("ticks", [True, False])
