@@ -14,11 +14,18 @@ from companion.config.controller import LawConfig
 from companion.config.loader import load_flight
 from companion.control.arm_hold import ArmHold, towards
 from companion.control.arm_model import manipulator_of
-from companion.control.common import Actuation, DesiredForce, ForceFilter, tracking_errors, wrench_of
+from companion.control.common import (
+    AccelerationFilter,
+    Actuation,
+    DesiredForce,
+    ForceFilter,
+    tracking_errors,
+    wrench_of,
+)
 from companion.control.thrust import ForceLimits, TiltFilter, saturate_force
 from companion.control.types import PlantState
 from companion.mission.reference import at_rest
-from companion.model.frames import quat_from_euler_zyx, quat_rotate, yaw_from_quat
+from companion.model.frames import quat_from_euler_zyx, quat_rotate, wrap_rad, yaw_from_quat
 from companion.model.types import Vec3
 
 CONFIG = load_flight("configs/missions/catch.yaml")
@@ -26,6 +33,15 @@ VEHICLE, LAW = CONFIG.vehicle, cast(LawConfig, CONFIG.controller)
 WEIGHT_N = VEHICLE.airframe.mass_kg * 9.81
 DT_S = 0.005
 UP: Vec3 = (0.0, 0.0, 1.0)
+STATE = PlantState(
+    position_world_m=(1.0, 2.0, 3.0),
+    velocity_world_m_s=(0.1, 0.2, 0.3),
+    acceleration_world_m_s2=(0.0, 0.0, 0.0),
+    attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
+    angular_rate_body_rad_s=(9.0, 9.0, 0.5),
+    arm_rad=(1.0, 2.0),
+    arm_rate_rad_s=(0.3, 0.4),
+)
 LIMITS = ForceLimits(vertical_min_n=9.0, vertical_max_n=50.0, lateral_max_n=8.0, tilt_max_tan=0.4)
 
 
@@ -79,6 +95,7 @@ def test_whatever_a_law_asks_for_thrust_tilt_and_force_stay_within_the_limits(
     assert lateral_n <= z * math.tan(math.radians(VEHICLE.airframe.tilt_max_deg)) + 1e-9
     assert found.collective_n == pytest.approx(max(0.0, x * body_z[0] + z * body_z[2]))
     assert found.attitude_wxyz[0] >= 0.0
+    assert wrap_rad(yaw_from_quat(found.attitude_wxyz) - yaw_rad) == pytest.approx(0.0, abs=1e-6)
     thrust = quat_rotate(found.attitude_wxyz, UP)
     share = math.hypot(x, y, z)
     assert thrust == pytest.approx((x / share, y / share, z / share), abs=2e-3)
@@ -103,6 +120,14 @@ def test_a_rate_of_yaw_in_other_units_leads_by_half_a_radian_and_one_that_is_no_
         assert math.isnan(found.attitude_wxyz[0])
     else:
         assert yaw_from_quat(found.attitude_wxyz) == pytest.approx(0.7 + math.copysign(0.5, rate_rad_s))
+
+
+def test_before_the_first_tick_nothing_is_commanded() -> None:
+    found, nothing = actuation(), (0.0, 0.0, 0.0)
+    assert (found.attitude_wxyz, found.roll_pitch_yaw_rad) == ((1.0, 0.0, 0.0, 0.0), nothing)
+    assert (found.force_world_n, found.collective_n, found.arm_torque_nm) == (nothing, 0.0, (0.0, 0.0))
+    assert found.clipped == (False, False, False) and not found.any_clipped
+    assert DesiredForce(0.5).world_n == nothing
 
 
 def test_upside_down_there_is_no_thrust() -> None:
@@ -165,6 +190,15 @@ def test_the_force_filter_is_first_order_and_starts_from_zero_after_a_gap() -> N
     assert filtered.step(DT_S, (1.0, -1.0, 4.0)) == pytest.approx((share, -share, 4.0 * share))
 
 
+def test_the_acceleration_filter_is_first_order_and_differentiates_the_rates_of_the_joints() -> None:
+    filtered, share = AccelerationFilter(5.0), 1.0 - math.exp(-2.0 * math.pi * 5.0 * DT_S)
+    first = replace(STATE, acceleration_world_m_s2=(1.0, 2.0, 3.0))
+    assert filtered.step(DT_S, first) == [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    then = filtered.step(DT_S, replace(first, acceleration_world_m_s2=(2.0, 0.0, 3.0), arm_rate_rad_s=(0.31, 0.38)))
+    gains = (share, -2.0 * share, 0.0, 0.0, 0.0, 0.0, share * 0.01 / DT_S, -share * 0.02 / DT_S)
+    assert then == pytest.approx([a + b for a, b in zip((1.0, 2.0, 3.0, *(0.0,) * 5), gains, strict=True)])
+
+
 def test_the_desired_force_follows_in_its_time_constant_and_never_beyond() -> None:
     desired = DesiredForce(0.5)
     desired.advance(0.1, (1.0, -2.0, 5.0))
@@ -179,22 +213,13 @@ def test_the_desired_force_follows_in_its_time_constant_and_never_beyond() -> No
 
 
 def test_errors_are_state_minus_reference_and_no_error_of_tilt() -> None:
-    state = PlantState(
-        position_world_m=(1.0, 2.0, 3.0),
-        velocity_world_m_s=(0.1, 0.2, 0.3),
-        acceleration_world_m_s2=(0.0, 0.0, 0.0),
-        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
-        angular_rate_body_rad_s=(9.0, 9.0, 0.5),
-        arm_rad=(1.0, 2.0),
-        arm_rate_rad_s=(0.3, 0.4),
-    )
     reference = replace(
         at_rest((0.5, 1.0, 1.0), 3.0, (0.5, 1.0)),
         velocity_world_m_s=(0.05, 0.05, 0.05),
         yaw_rate_rad_s=0.2,
         arm_rate_rad_s=(0.1, 0.1),
     )
-    error, rate = tracking_errors(state, reference, -3.0)
+    error, rate = tracking_errors(STATE, reference, -3.0)
     assert error == pytest.approx((0.5, 1.0, 2.0, 0.0, 0.0, 2.0 * math.pi - 6.0, 0.5, 1.0))
     assert rate == pytest.approx((0.05, 0.15, 0.25, 0.0, 0.0, 0.3, 0.2, 0.3))
 
