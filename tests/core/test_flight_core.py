@@ -44,6 +44,9 @@ def test_before_the_first_control_tick_there_is_no_error_and_no_mission_time() -
     _, observation = core._observe(healthy(), 0.005)
     assert (observation.position_error_m, observation.yaw_error_rad) == ((0.0, 0.0, 0.0), 0.0)
     assert (observation.force_world_n, observation.reference) == (None, None)
+    assert not core._context.waiting
+    core._observe(replace(healthy(1), status=None), 0.005)
+    assert core._context.waiting, "the rules judge nothing while inputs are missing"
     assert core.step(replace(healthy(1), status=None)).mission_t_s == 0.0
 
 

@@ -50,8 +50,13 @@ def said(**fields: Any) -> PartnerState:
 
 
 def after(
-    held: FlightState, height_m: float = 1.3, partner: PartnerState | None = None, force_n: float = 2.0
+    held: FlightState,
+    height_m: float = 1.3,
+    partner: PartnerState | None = None,
+    force_n: float = 2.0,
+    texts: list[str] | None = None,
 ) -> FlightState:
+    """The state after a tick; the texts of its events are added to `texts`."""
     observation = Observation(
         inputs=inputs(height_m, partner),
         airborne=True,
@@ -69,6 +74,8 @@ def after(
     )
     t = Transition(PARAMETERS, held, (), observation)
     let_go_if_better(t)
+    if texts is not None:
+        texts += [event.text for event in t.events]
     return t.state
 
 
@@ -111,9 +118,11 @@ def test_a_landing_of_one_alone_lets_go_when_the_feet_are_low(partner: PartnerSt
 
 
 def test_a_vehicle_that_px4_lands_lets_go_when_the_feet_are_low() -> None:
-    landing = state(stage=Stage.AUTOPILOT_LAND)
-    assert not let_go(after(landing, 0.96, said()))
-    assert let_go(after(landing, 0.93, said()))
+    landing, texts = state(stage=Stage.AUTOPILOT_LAND), list[str]()
+    assert not let_go(after(landing, 0.96, said(), texts=texts))
+    assert let_go(after(landing, 0.93, said(), texts=texts))
+    assert let_go(after(landing, 0.8, said(), texts=texts))
+    assert texts == [f"the bar is let go: its feet are {height_m} m above the floor" for height_m in ("0.09", "0.00")]
 
 
 @pytest.mark.parametrize(

@@ -381,6 +381,9 @@ def test_a_hold_lets_the_phase_leave_what_it_does(ends: bool) -> None:
 
 
 def test_a_phase_that_raises_an_error_is_named_with_the_place_of_it() -> None:
-    _, request = tick(in_plan(own=NOTHING, engaged=ENGAGED), parameters=probed(Probe(fails=True)))
+    """After a hold the plan's time may have passed the end of the phase."""
+    phases = tuple(Probe(fails=True, title=f"probe {index}") for index in range(len(P.phases)))
+    before = in_plan(ENGAGED.end_s + 0.1, own=NOTHING, engaged=ENGAGED)
+    _, request = tick(before, parameters=dataclasses.replace(P, phases=phases, acts=True))  # type: ignore[arg-type]
     (text,) = [event.text for event in request.events if event.id == "phase_failed"]
-    assert re.fullmatch(r"phase 'probe' failed: .*boom.* \(test_reactions\.py:\d+\)", text)
+    assert re.fullmatch(rf"phase 'probe {ENGAGED.index}' failed: .*boom.* \(test_reactions\.py:\d+\)", text)

@@ -143,6 +143,7 @@ def test_a_plan_that_ends_without_touchdown_is_landed_by_px4_after_five_seconds(
     assert not lands or (state.landing is not None and state.landing.pose_s == NOW_S), "that of this tick"
     assert ids(request) == (["no_touchdown"] if lands else [])
     assert state.outcome is (Outcome.ABORTED if lands else None)
+    assert not state.pilot_flies
 
 
 def test_spool_up_and_touchdown_scale_the_thrust() -> None:

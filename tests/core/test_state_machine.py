@@ -85,6 +85,7 @@ def test_a_transition_done_twice_gives_the_same_and_leaves_its_arguments_alone(m
         for overrides in ((), landing)
     ]
     assert [flown[-1].outcome for flown in outputs] == [Outcome.COMPLETED, Outcome.ABORTED]
+    assert "catch" in {event.id for o in outputs[0] for event in o.events}
     assert_observes_the_tick_before(outputs[0], observations)
     assert stages >= {
         Stage.WAIT,

@@ -124,18 +124,21 @@ def test_tipped_over_on_the_floor_it_is_disarmed_by_force() -> None:
     assert not landing.forced
     landing.run(0.4, attitude=ON_ITS_ROTORS, height_m=0.45)
     assert landing.forced and landing.takeover.overturned
+    landing.takeover.restart(landing.t_s)
+    landing.run(0.05)
+    assert landing.takeover.overturned, "also after an error"
     assert "tipped over on the floor: FORCE_DISARM is requested at once" in [notice.text for notice in landing.notices]
 
 
 def test_from_a_surface_the_vehicle_moves_back_before_px4_is_told_to_land() -> None:
-    landing = Landing(replace(beat(), back_world_m=(-0.3, 0.0, 0.0)))
-    landing.run(1.0, mode=OFFBOARD_MODE, height_m=1.1)
+    landing, yawed = Landing(replace(beat(), back_world_m=(-0.3, 0.0, 0.0))), quat_from_euler_zyx(0.0, 0.0, 0.3)
+    landing.run(1.0, mode=OFFBOARD_MODE, height_m=1.1, attitude=yawed)
     assert landing.positions and not landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
-    landing.run(1.5, mode=OFFBOARD_MODE, height_m=1.1)
+    landing.run(1.5, mode=OFFBOARD_MODE, height_m=1.1, attitude=yawed)
     east_m = [m.y for m in landing.positions]
     assert east_m == sorted(east_m, reverse=True) and east_m[-1] == pytest.approx(-0.3, abs=1e-3)
     assert {round(m.z, 6) for m in landing.positions} == {-1.1}
-    assert {round(m.yaw, 6) for m in landing.positions} == {round(0.5 * math.pi, 6)}
+    assert {round(m.yaw, 6) for m in landing.positions} == {round(0.5 * math.pi - 0.3, 6)}
     assert landing.wire.commands(mavlink.MAV_CMD_NAV_LAND)
 
 
