@@ -115,15 +115,16 @@ def test_a_setpoint_from_an_old_state_does_not_leave(vehicle: Vehicle) -> None:
     assert Gate(vehicle).check(good, None, None, False, state_age_s=NAN).attitude is None
 
 
-def test_thrust_changes_no_faster_than_it_may() -> None:
+@pytest.mark.parametrize(("before", "asked", "sent"), [(0.1, 0.9, 0.6), (0.9, 0.1, 0.4)])
+def test_thrust_changes_no_faster_than_it_may(before: float, asked: float, sent: float) -> None:
     gate = Gate(VEHICLE)
-    gate.check(AttitudeSetpoint(LEVEL, 0.1), None, None, False, t_s=1.0)
-    cut = gate.check(AttitudeSetpoint(LEVEL, 0.9), None, None, False, t_s=1.005)
+    gate.check(AttitudeSetpoint(LEVEL, before), None, None, False, t_s=1.0)
+    cut = gate.check(AttitudeSetpoint(LEVEL, asked), None, None, False, t_s=1.005)
     assert cut.attitude is not None
-    assert cut.attitude.thrust == pytest.approx(0.6)  # 100 /s
+    assert cut.attitude.thrust == pytest.approx(sent)  # 100 /s
     assert [refusal.kind for refusal in cut.refused] == ["thrust slew"]
-    free = gate.check(AttitudeSetpoint(LEVEL, 0.9), None, None, False, t_s=1.01)
-    assert free.attitude is not None and free.attitude.thrust == 0.9
+    free = gate.check(AttitudeSetpoint(LEVEL, asked), None, None, False, t_s=1.01)
+    assert free.attitude is not None and free.attitude.thrust == asked
     assert not free.refused
 
 
