@@ -7,8 +7,9 @@ import pytest
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.types import Inputs, MocapPose, SafetyAction
 from companion.safety.flight_context import FlightContext
-from companion.safety.mocap import unfused
+from companion.safety.mocap import limits_of, unfused
 from companion.safety.monitors import Monitors
+from companion.safety.pose_filter import PoseFilter
 from companion.safety.rules import RULES
 from tests.safety.faults import (
     NAN,
@@ -340,3 +341,12 @@ def test_a_frame_without_the_body_does_not_end_a_freeze() -> None:
         assert monitors.trusted is not None and monitors.trusted.mocap is None
     monitors.check(healthy(80), flying())
     assert monitors.trusted is not None and monitors.trusted.mocap is not None, "the pose moves again"
+
+
+def test_a_repeated_an_untracked_or_a_late_pose_is_not_passed_on() -> None:
+    checked, poses = PoseFilter(limits_of(VEHICLE.safety)), [healthy(k).mocap for k in range(4)]
+    first, second, third, fourth = (pose for pose in poses if pose is not None)
+    assert checked.check(first, None) and not checked.check(replace(first, stamp_s=second.stamp_s), None)
+    assert not checked.check(replace(third, tracking_valid=False), None)
+    assert not checked.check(replace(third, latency_s=VEHICLE.safety.mocap_latency_max_s + 0.01), None)
+    assert checked.check(fourth, None)
