@@ -5,7 +5,7 @@
 
 An action is held for 1 to 25 steps, drawn anew for each episode, so that some agents tremble and others push. Half of the processes add
 it to the base law's wrench, the others replace that. Every observation must lie in its space and every reward be finite. The memory is
-the resident memory of a process after a tenth of its steps, and at its end.
+the largest resident memory of a process at a reset in the first half of its steps, and in the second.
 """
 
 from __future__ import annotations
@@ -41,9 +41,8 @@ class Flown:
     steps: int
     outcomes: Counter[str]
     cpu_s: float
-    first_mib: float
-    last_mib: float
-    """Resident memory after a tenth of the steps, and at the end."""
+    half_mib: tuple[float, float]
+    """Largest resident memory at a reset in each half of the steps."""
     files: int
     """Open files at the end, less those at the beginning."""
 
@@ -62,7 +61,7 @@ def fly(name: str, action: str, steps: int, seed: int) -> Flown:
     """
     environment = gymnasium.make(f"companion/{name}-v0", action=action)
     generator, outcomes = np.random.default_rng(seed), Counter[str]()
-    files, first_mib, count, cpu_s = len(os.listdir("/proc/self/fd")), math.nan, 0, time.process_time()
+    files, resident, count, cpu_s = len(os.listdir("/proc/self/fd")), ([0.0], [0.0]), 0, time.process_time()
     environment.reset(seed=seed)
     while count < steps:
         over, held, hold = False, np.zeros(0), int(generator.integers(1, HOLD_MAX, endpoint=True))
@@ -73,15 +72,14 @@ def fly(name: str, action: str, steps: int, seed: int) -> Flown:
             if not environment.observation_space.contains(observation) or not math.isfinite(float(reward)):
                 raise ValueError(f"{name}: observation {observation}, reward {reward}")
             count += 1
-            if count == steps // 10:
-                first_mib = resident_mib()
+        resident[2 * count > steps].append(resident_mib())
         if over:
             outcomes[info["row"]["outcome"]] += 1
             environment.reset()
     cpu_s = time.process_time() - cpu_s
     environment.close()
     opened = len(os.listdir("/proc/self/fd")) - files
-    return Flown(f"{name}, {action}", count, outcomes, cpu_s, first_mib, resident_mib(), opened)
+    return Flown(f"{name}, {action}", count, outcomes, cpu_s, (max(resident[0]), max(resident[1])), opened)
 
 
 def companion() -> tuple[str, int, Callable[[], object]]:
@@ -162,7 +160,7 @@ def main() -> None:
     arguments = [(*case, a.steps // len(cases), a.seed + number) for number, case in enumerate(cases)]
     with ProcessPoolExecutor(a.jobs, max_tasks_per_child=1) as pool:
         for flown in pool.map(fly, *zip(*arguments, strict=True)):
-            memory = f"{flown.first_mib:5.0f} to {flown.last_mib:5.0f} MiB, {flown.files:+d} files"
+            memory = "{:.0f}, {:.0f} MiB, {:+d} files".format(*flown.half_mib, flown.files)
             rate = flown.steps / flown.cpu_s
             print(f"{flown.name:20} {flown.steps:8d} steps {rate:6.0f} /s {memory}  {dict(flown.outcomes)}", flush=True)
 

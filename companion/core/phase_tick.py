@@ -95,9 +95,8 @@ def leave(t: Transition) -> None:
         PhaseFailed: as in `advance_phase`.
     """
     own, engaged = t.state.own, t.state.engaged
-    if own is None:
+    if own is None or engaged is None:
         return
-    assert engaged is not None
     phase = _phase_of(t, engaged)
     try:
         left = phase.leave(own, t.i.t_s)
