@@ -107,6 +107,8 @@ def test_dead_or_hanging_in_the_air_it_takes_over_and_lands(tmp_path: Path, numb
         assert sound(rig.events) == ["guardian_took_over", "guardian_land", "guardian_landed"]
         assert outcome_of(rig.result) is Outcome.ABORTED
         assert rig.log_ids == rig.events, "the recorder got the same"
+        said = [message for message in rig.messages if isinstance(message, FlightEvent)]
+        assert all(5.0 <= message.mission_t_s < 5.0 + message.t_s for message in said)
         assert rig.result == GuardianEnded(landed=True, overturned=False)
         sources = {(m.get_srcSystem(), m.get_srcComponent()) for m in rig.peer.received}
         assert sources == {OWN_IDS}
