@@ -33,6 +33,13 @@ def test_vision_that_has_never_been_fused_is_not_lost() -> None:
     assert watched(EXTERNAL, [estimator(flags=0b1111)(healthy(k)) for k in range(100)], standing()) == []
 
 
+@pytest.mark.parametrize("stamp", ["position_stamp_s", "attitude_stamp_s", "imu_stamp_s"])
+def test_a_part_of_the_state_that_falls_silent_alone_is_a_lost_state(stamp: str) -> None:
+    silent = put("vehicle", **{stamp: START_S})
+    events = watched(EXTERNAL, [silent(healthy(k)) for k in range(100)], flying())
+    assert "vehicle_state_lost" in [event.id for event in events]
+
+
 def test_the_estimators_last_report_counts_until_the_next_one_comes() -> None:
     rejected = estimator(position_horizontal_ratio=1.2)
     inputs = [rejected(healthy(k)) if k < 5 else replace(healthy(k), mocap=None, estimator=None) for k in range(70)]
