@@ -205,7 +205,7 @@ def test_a_parameter_that_only_a_real_px4_has_is_left_to_it() -> None:
     ("release", "absent"),
     [
         *(((1, minor), {"SENS_GPS0_DELAY", "SENS_GPS1_DELAY", "MC_REF_W_N"}) for minor in (15, 16, 17)),
-        ((1, 18), {"EKF2_GPS_DELAY", "SIM_BAT_ENABLE"}),
+        ((1, 18), {"COM_KILL_DISARM", "EKF2_GPS_DELAY", "SIM_BAT_ENABLE"}),
     ],
 )
 def test_each_version_has_its_own_parameters_and_none_of_another_is_missed(
