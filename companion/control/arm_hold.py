@@ -26,11 +26,15 @@ class ArmHold:
         """Factor on the gains of each joint."""
         self._gains = [(STIFFNESS_NM_RAD * ratio, DAMPING_NMS_RAD * ratio) for ratio in self.ratios]
 
+    def gravity_torque_nm(self, angle_rad: Joints, attitude: Quat) -> Joints:
+        """Return the nominal gravity torques of the joints, N m."""
+        return self._manipulator.gravity_torque_nm(angle_rad, attitude)
+
     def torque_nm(
         self, angle_rad: Joints, rate_rad_s: Joints, target_rad: Joints, target_rate_rad_s: Joints, attitude: Quat
     ) -> Joints:
         """Return the joint torques towards the target, N m, with nominal gravity compensation."""
-        gravity = self._manipulator.gravity_torque_nm(angle_rad, attitude)
+        gravity = self.gravity_torque_nm(angle_rad, attitude)
         torque = [
             g + stiffness * (target - angle) + damping * (target_rate - rate)
             for g, (stiffness, damping), angle, rate, target, target_rate in zip(

@@ -13,6 +13,7 @@ from companion.control.arm_hold import ArmHold, towards
 from companion.control.arm_model import manipulator_of
 from companion.control.disturbance import DisturbanceObserver
 from companion.control.force_observer import ForceObserver
+from companion.control.gain_backoff import GainBackoff
 from companion.control.hover_thrust import HoverThrust, off_the_ground
 from companion.control.joint_prediction import JointPrediction
 from companion.control.online import OnlineImpedance
@@ -24,7 +25,7 @@ from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat, quat_from_euler_zyx, quat_rotate
 from companion.model.outputs import ControlLog
-from companion.model.types import AttitudeSetpoint, Inputs, Joints, Reference, Vec3
+from companion.model.types import AttitudeSetpoint, Inputs, Joints, Reference, Vec3, VehicleState
 
 FOLD_RATE_RAD_S = 1.2
 PULL_TIME_S, PULL_LAG_S, PULL_MAX_N = 0.1, 0.05, 100.0
@@ -63,6 +64,7 @@ class VehicleControl:
         self._force_timeout_s = vehicle.safety.force_timeout_s
         self._arm_hold = ArmHold(vehicle)
         self._joints = JointPrediction(vehicle)
+        self._backoff = GainBackoff()
         self._sensing = ForceSensing(vehicle.tool, manipulator_of(vehicle))
         self._slide = Slide(vehicle)
         self._acceleration = MeanAcceleration()
@@ -105,6 +107,10 @@ class VehicleControl:
     def thrust_share(self) -> float:
         """Return the thrust of the law's last command divided by hover thrust."""
         return self._thrust_sent / self._hover.value
+
+    def watch_joints(self, i: Inputs, dt_s: float, swings: bool) -> None:
+        """Lower the feedback of the arm while a joint swings or joint states are very late, and raise it again afterwards."""
+        self._backoff.update(dt_s, swings, i.t_s - i.arm.measured_s if i.arm is not None else 0.0)
 
     def begin_tare(self) -> None:
         """Start a new tare. The previous one stays valid until the new one is finished."""
@@ -154,8 +160,15 @@ class VehicleControl:
         target, still = self._arm_target_rad or i.arm.angle_rad, (0.0,) * len(i.arm.angle_rad)
         angles, rates = self._joints.now(i.t_s, i.arm)
         torque = self._arm_hold.torque_nm(angles, rates, target, still, i.vehicle.attitude_wxyz)
-        self._joints.sent(i.t_s, torque)
-        return torque
+        return self._sent(i.t_s, torque, angles, i.vehicle)
+
+    def _sent(self, t_s: float, torque_nm: Joints | None, angle_rad: Joints, vehicle: VehicleState) -> Joints | None:
+        """Return the torques for the arm: with less feedback after a joint has swung."""
+        if torque_nm and self._backoff.share < 1.0:
+            gravity_nm = self._arm_hold.gravity_torque_nm(angle_rad, vehicle.attitude_wxyz)
+            torque_nm = self._backoff.torque_nm(torque_nm, gravity_nm)
+        self._joints.sent(t_s, torque_nm)
+        return torque_nm
 
     def fly(self, i: Inputs, dt_s: float, reference: Reference, vertical_scale: float) -> Command:
         """Run one tick of the control law. `vertical_scale` is as in `Controller.step`."""
@@ -209,7 +222,7 @@ class VehicleControl:
             torque = self._slide.torque_nm(dt_s, torque, state, reference.slide_world_n, pressing, force)
             friction = None if force is None else across(force, pressing)
             attitude = self._slide.attitude(dt_s, attitude, state, reference, friction)
-        self._joints.sent(i.t_s, torque)
+        torque = self._sent(i.t_s, torque, arm_rad, vehicle)
         if self._observer is not None:
             observed = self._observer.force_n
             log = msgspec.structs.replace(log, force_observed_world_n=observed, force_measured_world_n=force)

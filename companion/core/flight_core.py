@@ -57,6 +57,8 @@ _POSE_AGE_MAX_S: Final = 0.1
 """Age of the last trusted pose beyond which the target impedance is not optimised."""
 # Looking up members of an enum costs time in every tick.
 _MISSION: Final = Stage.MISSION
+_REFUSED_AGAIN_S: Final = 1.0
+"""Time without a rejection of the same kind after which it is reported again."""
 _SPOOL: Final = Stage.SPOOL
 _TOUCHDOWN: Final = Stage.TOUCHDOWN
 _NO_COMMAND: Final = OperatorCommand.NONE
@@ -97,8 +99,9 @@ class FlightCore:
         """The last reference that the controller followed, constrained by the governor."""
         self._limited_by: tuple[str, ...] = ()
         self._log: ControlLog | None = None
-        self._refused: tuple[Refusal, ...] = ()
-        """Commands that the gate rejected in the last tick; a new rejection is reported once."""
+        self._refused_s: dict[str, float] = {}
+        """Time at which the gate last rejected a command of each kind. A rejection is reported once, however often it comes and goes
+        within `_REFUSED_AGAIN_S`."""
 
     def step(self, inputs: Inputs) -> Outputs:
         """Run one control tick."""
@@ -109,6 +112,7 @@ class FlightCore:
         state, request = transition(self._parameters, before, observed, observation)
         self._state = state
         self._carry_out(request, i)
+        self._control.watch_joints(i, dt_s, self._monitors.arm_swings)
         reference, command = self._command(dt_s, i)
         self._log = command.log
         phase, kind, progress = state.phase(t_s)
@@ -128,7 +132,8 @@ class FlightCore:
             state_age_s=t_s - vehicle.attitude_stamp_s if vehicle else 0.0,
             arm_rate_rad_s=arm.velocity_rad_s if arm else None,
         )
-        if verdict.refused or self._refused:
+        self._context.torque_refused = None
+        if verdict.refused:
             self._report_refused(t_s, verdict.refused, events)
         start_s = state.mission_start_s
         return Outputs(
@@ -267,9 +272,10 @@ class FlightCore:
                 self._control.finish_tare()
 
     def _report_refused(self, t_s: float, refused: tuple[Refusal, ...], events: list[Event]) -> None:
-        before = {refusal.kind for refusal in self._refused}
-        events += [event_of(notices.GATE, t_s, refusal.text) for refusal in refused if refusal.kind not in before]
-        self._refused = refused
+        for refusal in refused:
+            if t_s - self._refused_s.get(refusal.kind, -math.inf) > _REFUSED_AGAIN_S:
+                events.append(event_of(notices.GATE, t_s, refusal.text))
+            self._refused_s[refusal.kind] = t_s
         self._context.torque_refused = next((refusal.text for refusal in refused if refusal.limp), None)
 
     # -- command ---------------------------------------------------------------------------------------------------

@@ -27,7 +27,7 @@ LATE_S: Final = 0.005
 """Age beyond which a joint state counts as late. Torques are computed for the angles and rates predicted from it
 (`companion.control.joint_prediction`), whose margin is used up at 20 ms."""
 MISSING_S: Final = 0.05
-"""Age beyond which a joint state is missing and not late: `arm_read_failures` and `arm_lost` report that."""
+"""Time since the last answer beyond which a joint state is missing and not late: `arm_read_failures` and `arm_lost` report that."""
 LATE_SHARE: Final = 0.08
 """Share of ticks with a late joint state from which the bus counts as late."""
 LATE_TIME_S: Final = 1.0
@@ -97,9 +97,8 @@ class ArmTracker:
             if newest is not None and arm.stamp_s > newest.stamp_s:
                 self.before = newest
                 self._swing.update(arm)
-            age_s = i.t_s - arm.measured_s
-            if age_s <= MISSING_S:
-                self._update_lateness(age_s)
+            if i.t_s - arm.stamp_s <= MISSING_S:
+                self._update_lateness(i.t_s - arm.measured_s)
         self.swing = self._swing.swinging(i.t_s)
 
     @property

@@ -187,7 +187,7 @@ DEVICE_RULES: tuple[Rule, ...] = (
     Rule(
         id="joint_swings", subject=Subject.ARM, what="a joint swings: its rate turns three times in 0.5 s, by 2 rad/s and more",
         predicate=arm.joint_swings, ground=_WARN, air=_WARN,
-        message="joint {} swings at {:.0f} Hz with {:.0f} deg/s; no catch is detected meanwhile",
+        message="joint {} swings at {:.0f} Hz with {:.0f} deg/s; the arm gets less feedback, and no catch is detected meanwhile",
     ),
     Rule(
         id="joint_swings_on", subject=Subject.ARM, what="a joint still swings", predicate=arm.joint_swings, hold_time=1.5,

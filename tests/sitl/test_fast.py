@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from companion.control.types import PlantState, Wrench
 from companion.model.servos import WATCHDOG_ERROR
-from companion.model.types import Joints, Outcome, PhaseKind, Reference, SafetyAction
+from companion.model.types import Joints, Outcome, PhaseKind, Reference, SafetyAction, Severity
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.faults.timing import ARMED_SEEN_S
@@ -48,6 +48,26 @@ def test_answers_that_come_10_ms_late_do_not_make_the_arm_swing() -> None:
     assert all(0.0099 < age_s < 0.0201 for age_s in ages_s)
     events = [event.id for o in result.outputs for event in o.events if event.id.startswith("joint_")]
     assert events == ["joint_states_late"]
+
+
+def test_an_arm_that_swings_because_answers_are_12_ms_late_is_calmed_before_it_meets_its_limits() -> None:
+    late = "world.faults=[{kind: bus_delay, t_s: 2.3, size: 0.012}]"
+    result = FastFlight(load_sitl("configs/missions/catch.yaml", world="lab", overrides=("world.seed=1", late))).run(
+        11.5
+    )
+    events = [event.id for o in result.outputs for event in o.events if event.id.startswith("joint_")]
+    assert events == ["joint_states_late", "joint_swings"]
+    rates = [max(map(abs, i.arm.velocity_rad_s)) for i in result.inputs if i.arm is not None and i.t_s > 10.4]
+    assert max(rates) < 2.5, "the mission turns the arm by up to 2 rad/s"
+
+
+def test_answers_that_hardly_come_at_all_are_reported_once() -> None:
+    late = "world.faults=[{kind: bus_delay, t_s: 2.3, size: 0.08}]"
+    result = FastFlight(load_sitl("configs/missions/catch.yaml", world="lab", overrides=("world.seed=2", late))).run(
+        9.0
+    )
+    events = [event.id for o in result.outputs for event in o.events if event.severity is not Severity.INFO]
+    assert sorted(events) == ["gate", "joint_states_late"]
 
 
 def test_a_silent_servo_lets_go_and_that_is_reported_when_it_answers_again() -> None:
