@@ -23,7 +23,7 @@ from companion.model.types import Inputs, OperatorCommand, Reference, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate
 from companion.phases.intercept.meeting import BODY_S2, RISES_S, TILT_S2_M, Lag, meetings, reach_of
-from companion.phases.intercept.motion import Bounds, State
+from companion.phases.intercept.motion import OVERSHOOT, Bounds, State
 from companion.phases.intercept.net import net_m, opening
 from companion.phases.intercept.phase import Intercept, Interception, Mode
 from companion.safety.governor import SafeSet
@@ -229,7 +229,8 @@ def test_the_way_to_none_of_200_balls_and_the_stop_after_it_leave_a_limit() -> N
             assert all(
                 abs(p - h) <= b for p, h, b in zip(s.position_m, HOME.position_world_m, PHASE.box_m, strict=True)
             )
-            place = tuple(p + stops.time_s(speed) * v for p, v in zip(s.position_m, s.velocity_m_s, strict=True))
+            ahead_s = OVERSHOOT * stops.time_s(OVERSHOOT * speed)
+            place = tuple(p + ahead_s * v for p, v in zip(s.position_m, s.velocity_m_s, strict=True))
             assert SAFE.holds(s.position_m) and SAFE.holds((place[0], place[1], place[2]))
         assert math.hypot(*stop.at(stop.end_s).velocity_m_s) < 1e-9, "at rest after the stop"
     assert found > 50, "too few balls are met to judge"

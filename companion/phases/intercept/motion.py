@@ -31,6 +31,8 @@ STOP_LEAST_S: Final = 0.5
 """Shortest duration of a stop."""
 PIECES: Final = 3
 """Number of pieces of a motion that are compared with the limits: the coefficients of a short piece are close to the curve."""
+OVERSHOOT: Final = 1.4
+"""Speed of the body, as a multiple of the reference's, for which there is room to stop: it comes later, and then faster."""
 EASED = (1.0, 0.5, 0.0)
 """Fractions of the wanted acceleration that are tried one after the other."""
 BRAKE_M_S2: Final = 2.0
@@ -159,7 +161,7 @@ class Bounds:
         places = _integrated(m.begin.position_m, speeds, h / 5.0)
         # The velocity in the coefficients of degree 5.
         raised = [_plus(scaled(speeds[max(0, k - 1)], 0.2 * k), speeds[min(4, k)], 1.0 - 0.2 * k) for k in range(6)]
-        stop_s, safe = self._stop.time_s(fastest), self._safe
+        stop_s, safe = OVERSHOOT * self._stop.time_s(OVERSHOOT * fastest), self._safe
         return all(
             self.in_box(p) and safe.holds(p) and safe.holds(_plus(p, v, stop_s))
             for p, v in zip(places, raised, strict=True)
