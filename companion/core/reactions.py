@@ -47,11 +47,6 @@ def supervise(t: Transition) -> None:
 
 def _escalate(t: Transition) -> None:
     before, events, standing = t.state.supervisor, t.events, None
-    if before.cause == PARTNER_HOLDS:
-        own = next((event.id for event in events if event.action is _HOLD and event.id != PARTNER_HOLDS), None)
-        if own is not None:  # now this vehicle, too, is to be resumed by the operator
-            t.change(supervisor=replace(before, cause=own))
-            before = t.state.supervisor
     if before.action is _HOLD and any(event.id == OPERATOR_RESUME for event in events):
         standing = t.o.standing
         if (
@@ -60,6 +55,9 @@ def _escalate(t: Transition) -> None:
             t.change(supervisor=replace(before, cause=PARTNER_HOLDS))
             before, events = t.state.supervisor, [event for event in events if event.id != OPERATOR_RESUME]
     after = update(before, events, t.i.t_s, t.parameters.times, standing)
+    if after.cause == PARTNER_HOLDS:  # with a cause of its own, this vehicle, too, is to be resumed by the operator
+        own = (event.id for event in events if event.action is _HOLD and event.id != PARTNER_HOLDS)
+        after = replace(after, cause=next(own, PARTNER_HOLDS))
     if after is not before:
         t.change(supervisor=after)
     if after.action is before.action:

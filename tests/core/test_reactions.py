@@ -294,6 +294,16 @@ def test_a_vehicle_that_holds_for_the_other_and_finds_a_reason_of_its_own_is_hel
     assert after(held_by("partner_holds"), event_id, action)[0].supervisor.cause == cause
 
 
+def test_of_two_reasons_in_one_tick_the_one_of_its_own_holds_it() -> None:
+    own, partner = (
+        Event(t_s=healthy().t_s, id=name, severity=Severity.WARNING, action=SafetyAction.HOLD, text="")
+        for name in ("operator_hold", "partner_holds")
+    )
+    for events in ((own, partner), (partner, own)):
+        state, _ = tick(in_plan(grip=Grip.CARRYING), *events)
+        assert (state.supervisor.action, state.supervisor.cause) == (SafetyAction.HOLD, "operator_hold")
+
+
 def test_a_resume_without_a_hold_changes_nothing() -> None:
     for grip in (Grip.FREE, Grip.CARRYING):
         before = in_plan(grip=grip)
