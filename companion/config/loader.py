@@ -282,7 +282,9 @@ def _open_named(
     lines: list[str],
     read: Callable[[str], Document] = read_document,
 ) -> Document | None:
-    """Read the file `given` or, if that is None, the file that the mission names, relative to the mission file."""
+    """Read the file `given` or, if that is None, the file that the mission names, relative to the mission file. A vehicle
+    may be named as `--vehicle` names it.
+    """
     where = ""
     try:
         if given is not None:
@@ -293,7 +295,10 @@ def _open_named(
         origin = mission_file.origin(location)
         base = Path(mission_file.source).parent if origin.line else Path()
         where = f"{origin}: {key_path(location)}: "
-        return read(os.path.normpath(base / named))
+        path = base / named
+        if location == ("vehicle",) and not path.suffix and not path.exists():
+            path = named_file("vehicles", named)
+        return read(os.path.normpath(path))
     except ConfigError as error:
         lines += [where + line for line in error.lines]
         return None

@@ -86,7 +86,7 @@ class Mission(Model):
     schema_version: Literal[1]
     name: Name
     vehicle: str
-    """Path of the vehicle file, relative to this file."""
+    """Path of the vehicle file, relative to this file, or the name of a shipped one."""
     controller: ControllerChoice = ControllerChoice()
     start: Start
     limits: Limits

@@ -30,7 +30,7 @@ def near(path: Path) -> Path:
     return path.relative_to(here) if path.is_relative_to(here) else path
 
 
-def named_file(folder: str, given: str | Path, option: str) -> Path:
+def named_file(folder: str, given: str | Path, option: str = "") -> Path:
     """Return the path of the shipped file whose name is given; if there is none, return `given` as a path.
 
     Args:
@@ -46,5 +46,6 @@ def named_file(folder: str, given: str | Path, option: str) -> Path:
     if str(given) and not Path(given).suffix and not Path(given).exists():
         close = nearest(str(given), list(known))
         hint = f" (did you mean {close}?)" if close else ""
-        raise ConfigError([f"{option} {given}: expected {', '.join(known)} or a file, found neither{hint}"])
+        what = f"{option} {given}".lstrip()
+        raise ConfigError([f"{what}: expected {', '.join(known)} or a file, found neither{hint}"])
     return Path(given)

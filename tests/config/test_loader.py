@@ -210,6 +210,7 @@ BAD_OVERRIDES = [
     ("mission.phases[9].duration_s=3", "--set mission.phases[9].duration_s: mission.phases has no index 9; available: 0 to 6"),
     ("mission.name.x=3", "--set mission.name.x: mission.name has no keys; it is a single value"),
     ("mission.vehicle=none.yaml", "--set mission.vehicle: vehicle: none.yaml: no such file"),
+    ("mission.vehicle=tarot650_2x", "--set mission.vehicle: vehicle: tarot650_2x: expected hexa_2r, tarot650_2r, tarot650_2r_ball, tarot650_2r_clamp, tarot650_2r_rod, tarot650_4r or a file, found neither (did you mean tarot650_2r?)"),
     ("controller.rho_max=0", "--set controller.rho_max: expected a number > 0, got 0"),
     ("controller.stiffness_kp[2]=90", "--set controller.stiffness_kp[2]: gain_cond requires (K_d - M_d Phi) Phi = 144, got 90"),
     ("controller.damping_kd[0]=3", "--set controller.damping_kd[0]: gain_new requires K_d / M_d > Phi, got 3 <= 4"),
@@ -365,6 +366,13 @@ def test_a_vehicle_on_the_command_line_is_relative_to_the_current_directory(
     config = load_sitl(CATCH, vehicle_path="other.yaml", overrides=["vehicle.name=other"])
     assert config.vehicle.name == "other"
     assert config.sources.vehicle == "other.yaml"
+
+
+def test_a_mission_may_name_a_shipped_vehicle_and_a_file_beside_it_comes_first(project: Path) -> None:
+    assert load_sitl(CATCH, overrides=["mission.vehicle=hexa_2r"]).vehicle.name == "hexa-2r"
+    own = Path("hexa_2r")
+    own.write_text((ROOT / "configs/vehicles/tarot650_2r.yaml").read_text())
+    assert load_sitl(CATCH, overrides=["mission.vehicle=hexa_2r"]).vehicle.name == "tarot650-2r"
 
 
 def test_vehicle_and_world_load_alone(project: Path) -> None:
