@@ -98,7 +98,6 @@ class Process:
         """Return whether it wants to work at this instant.
 
         Args:
-            now_s: simulated time.
             data: whether a frame of motion capture was sent.
         """
         report = self._report
@@ -225,7 +224,6 @@ class TimeKeeper:
         """Advance simulated time, let every process that wants to work do so, and keep the pace.
 
         Args:
-            now_s: simulated time.
             data: whether a frame of motion capture was sent.
         """
         self._write(now_s)

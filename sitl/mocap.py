@@ -42,10 +42,7 @@ class Mocap:
     """Motion capture of one machine.
 
     Args:
-        config: configuration of the world.
         ball: how the thrown ball is seen; None if no marker is streamed.
-        scene: the scene of the machine.
-        machine: the machine whose body is tracked.
         between_steps: whether exposures are at the exact time between physics steps instead of at the end of a step.
     """
 

@@ -168,7 +168,6 @@ class NatNetServer:
 
         Args:
             t_s: time of transmission on the world's clock.
-            poses: rigid bodies of this frame.
             exposure_t_s: middle of the cameras' exposure on the same clock, or None if the cameras do not report it.
             markers: markers that belong to no rigid body, in the axes of the stream.
         """
@@ -265,7 +264,6 @@ def encode_frame(
 
     Args:
         version: NatNet bitstream version.
-        number: frame number.
         t_s: as for `NatNetServer.publish`.
         poses: as for `NatNetServer.publish`.
         exposure_t_s: as for `NatNetServer.publish`.

@@ -89,11 +89,6 @@ class Plant:
     """The simulated world with its sensors and motors.
 
     Args:
-        vehicle: vehicle file.
-        config: configuration of the world.
-        px4: the autopilot.
-        drives: motor of each joint.
-        start: pose of the vehicle at the start.
         between_steps: as in `Mocap`.
         jaws: motor of the clamp's servo; None without a clamp.
         scene: the scene of which this is machine `number`; None for a scene of its own.
@@ -281,9 +276,7 @@ class Plant:
         return ImuSample(self.scene.t_s, (p, -q, -r), (ax, -ay, -az))
 
     def battery(self) -> Battery:
-        """Return the measurement of the power module. If the battery effect is off, the charge falls linearly with the time since
-        arming.
-        """
+        """Return the power module's measurement; without the battery effect, the charge falls linearly since arming."""
         pack, sag_v = self.machine.battery, 0.0 if self.faults is None else self.faults.sag_v
         if pack is not None:
             return Battery(pack.voltage_v - sag_v, pack.current_a, pack.remaining, pack.drawn_as / 3.6)

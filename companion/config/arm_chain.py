@@ -111,9 +111,7 @@ def _bodies(arm: Arm) -> Iterator[ChainLink]:
 
 
 def _rods(arm: Arm) -> Iterator[ChainLink]:
-    """Yield rods along x, in line with each other at angle 0. Unless an axis is given, the first joint turns about +y, and the others
-    turn about -y.
-    """
+    """Yield rods along x, in line at angle 0. Unless an axis is given, the first joint turns about +y and the others about -y."""
     position: Vec3 = arm.shoulder_body_m
     usual: Vec3 = (0.0, 1.0, 0.0)
     lists = (arm.armatures_kg_m2, arm.link_lengths_m, arm.link_masses_kg, arm.link_com_m)

@@ -251,9 +251,7 @@ def _step(node: _Node, step: str | int) -> _Node | None:
 
 
 def _walk(schema: _Node, loc: tuple[str | int, ...]) -> tuple[Location, _Node | None, _Node | None]:
-    """Return the location in the document for Pydantic's location, which also contains union tags, and the schema nodes of the value
-    and of its parent.
-    """
+    """Return the location in the document for Pydantic's (which has union tags too), and the schema nodes of value and parent."""
     node: _Node | None = _resolve(schema, schema)
     parent: _Node | None = None
     at: list[str | int] = []

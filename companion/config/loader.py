@@ -220,9 +220,7 @@ def _rename_phase_keys(document: Document) -> None:
 
 
 def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
-    """Replace the names of poses in a mission by the vehicle's joint angles, and check the number of angles; without a valid vehicle,
-    a name is replaced by an empty pose.
-    """
+    """Replace poses' names in a mission by joint angles (empty without a valid vehicle), and check the number of angles."""
     phases = document.find(("phases",))
     places: list[Location] = [("start", "arm_deg")]
     places += [("phases", index, "arm_deg") for index in range(len(phases) if isinstance(phases, list) else 0)]

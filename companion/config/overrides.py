@@ -115,9 +115,7 @@ def _location(name: str, origin: Origin) -> tuple[Section, Location]:
 
 
 def _make_way(document: Document, override: Override) -> None:
-    """Create the parent mappings that are missing in the file, which leaves them to their defaults; reject indices that do not
-    exist.
-    """
+    """Create the parent mappings that are missing in the file, whose keys then have their defaults; reject indices beyond it."""
     value: Data = document.data
     for depth, step in enumerate(override.location):
         last = depth == len(override.location) - 1

@@ -135,9 +135,7 @@ def parse_value(text: str, origin: Origin) -> Data:
 
 
 def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
-    """Convert text to plain data. If `fixed` is given, as for an override, it is the origin of all values in place of line and
-    column.
-    """
+    """Convert text to plain data. `fixed`, as for an override, is the origin of all values in place of line and column."""
 
     def origin(mark: yaml.Mark | None) -> Origin:
         if fixed is not None or mark is None:
@@ -239,9 +237,7 @@ class _Builder:
 
 
 def _is_unicode(text: str) -> bool:
-    """Return whether the text is valid Unicode. An escape such as "\\uD800" leaves half of a UTF-16 pair, which JSON and terminals
-    reject.
-    """
+    """Return whether the text is valid Unicode; an escape such as "\ud800" leaves half of a UTF-16 pair, which JSON rejects."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -250,11 +246,7 @@ def _is_unicode(text: str) -> bool:
 
 
 def _scalar(text: str) -> Data:
-    """Return the value of a plain scalar by the core schema of YAML 1.2.
-
-    Raises:
-        ValueError: the scalar is a number with too many digits.
-    """
+    """Return the value of a plain scalar by the core schema of YAML 1.2; raises ValueError for a number with too many digits."""
     if _NULL.fullmatch(text):
         return None
     if _BOOL.fullmatch(text):

@@ -34,7 +34,6 @@ class TickCommand(NamedTuple):
     """The command of one tick."""
 
     command: OperatorCommand
-    """Command for the core."""
     asked: GroundCommand | None
     """The ground station's command that this tick executes and answers; None if there is none."""
     refused: str | None = None
@@ -119,10 +118,6 @@ class Operator:
     def judged(self, command: OperatorCommand, outputs: Outputs) -> int | None:
         """Update `hold`, the number of the active hold, and return it. A new hold begins with `SafetyAction.HOLD`, and with every
         hold command during it.
-
-        Args:
-            command: command of the tick.
-            outputs: the core's outputs of the tick.
         """
         if outputs.phase_kind is not PhaseKind.GROUND:
             self.recheck = None

@@ -217,9 +217,7 @@ class Flight:
         ipc.send(self._channel, done)
 
     def _goes_on(self, outputs: Outputs) -> bool:
-        """Report how a flight with a PX4 that was found armed goes on. Return False if PX4 has disarmed since, which ends the
-        flight.
-        """
+        """Report how a flight with a PX4 found armed goes on; return False if PX4 has disarmed since, which ends the flight."""
         goes_on = any(event.id == ARMED_EXTERNALLY for event in outputs.events)
         lines = [f"landing without this device: {line}" for line in self._devices.failures]
         if not goes_on:

@@ -46,8 +46,6 @@ class Ticker:
     therefore always about half to one and a half periods apart.
 
     Args:
-        period_s: period of the ticks.
-        clock: the flight clock.
         frame_rate_hz: rate of motion capture; frames are ignored if it is 0 or too far from the tick rate.
     """
 
@@ -123,10 +121,6 @@ class SimulatedTicker:
 
     If each of the last `_SLOW_TICKS` took more than a period of processor time, as on no vehicle that may fly, a tick is late by what
     the fastest of them took. A single slow tick says nothing: the time in which a virtual machine stands still is counted as well.
-
-    Args:
-        period_s: period of the ticks.
-        clock: the flight clock.
     """
 
     def __init__(self, period_s: float, clock: Clock) -> None:

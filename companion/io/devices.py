@@ -163,8 +163,6 @@ async def open_available(
     """Open the devices that can be opened and list the errors of the others.
 
     Args:
-        config: addresses and settings.
-        clock: the flight clock.
         show: called with the name of each device before it is opened, for the operator.
     """
     available = AvailableDevices(PoseForwarder())

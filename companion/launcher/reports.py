@@ -73,8 +73,6 @@ class FlightReports:
 
         Args:
             code: exit code of the flight process.
-            log_path: its log.
-            guardian: the guardian.
             sitl: the simulated world; None with hardware.
             stop_requested: whether the user has requested a landing.
         """
@@ -110,7 +108,6 @@ class FlightReports:
         """Return why the flight was refused, which process failed and where its log is.
 
         Args:
-            outcome: the flight's outcome.
             busy: that the computer was busy; None if it was not.
         """
         if outcome is not Outcome.REFUSED:

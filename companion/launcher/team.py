@@ -126,10 +126,7 @@ def run_team(
     """Fly a team in the simulated world, write the summaries and, if requested, the reports; return the exit code.
 
     Args:
-        team: checked configuration.
         out: existing folder of the flight; each member has a folder in it.
-        console: where to print.
-        report: whether to write the report of each member.
         speed: simulated seconds in a second of real time at most; None for a flight in real time.
         px4: whether two real PX4 fly in place of two stubs.
     """

@@ -106,12 +106,9 @@ class Air:
 
     Args:
         o: inputs of the tick.
-        vehicle: the vehicle file.
-        manipulator: kinematics of the arm.
         phases: phases of the mission (`companion.mission.phase.Phase`).
         segment: segment at the plan's time.
         engaged: segment of the phase whose state it is; after a hold, the plan's time may have passed its end.
-        limits: limits of the mission.
         safe: the governor's safe set.
         nominal: whether the supervisor has not reacted to anything so far.
         holds: whether it has reacted by a hold or more; a mere warning stops no plan.

@@ -46,8 +46,6 @@ def check_mission(
     tether, which adds up.
 
     Args:
-        mission: the mission to check.
-        vehicle: vehicle, tether and room.
         start_position_world_m: measured position of the body's origin; None for the mission's start, on the floor.
         start_yaw_rad: measured yaw; None for the mission's value.
         start_arm_rad: measured joint angles as in the paper; None for the mission's values.
@@ -140,9 +138,7 @@ def _samples(segment: Segment) -> Iterator[float]:
 def check_start(
     mission: Mission, vehicle: Vehicle, position_world_m: Vec3, yaw_rad: float, arm_rad: Joints | None
 ) -> list[str]:
-    """Return only the reasons that depend on the measured start; fast enough for a control tick. The arguments are those of
-    `check_mission`.
-    """
+    """Return only the reasons that depend on the measured start, fast enough for a tick; arguments of `check_mission`."""
     found = _start(mission, vehicle, position_world_m, yaw_rad, arm_rad)
     return [f"mission '{mission.name}': {text}" for text in found]
 

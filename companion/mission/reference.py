@@ -24,9 +24,7 @@ Septic: TypeAlias = tuple[float, float, float, float, float, float, float, float
 
 
 def minimum_snap(u: float) -> Shape:
-    """Return the profile that minimises the integral of f'''' squared, with f', f'' and f''' zero at both ends: 35 u^4 - 84 u^5 + 70
-    u^6 - 20 u^7.
-    """
+    """Return the profile of least integral of f'''' squared, with f' to f''' zero at both ends: 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7."""
     u2 = u * u
     u3 = u2 * u
     return (
@@ -38,9 +36,7 @@ def minimum_snap(u: float) -> Shape:
 
 
 def rest_to_rest(u: float) -> Shape:
-    """Return the quintic from 0 to 1 with zero velocity and acceleration at both ends: 10 u^3 - 15 u^4 + 6 u^5. Peak f' = 1.875, peak
-    f'' = 5.774.
-    """
+    """Return the quintic from 0 to 1, at rest at both ends: 10 u^3 - 15 u^4 + 6 u^5. Peak f' = 1.875, peak f'' = 5.774."""
     u2 = u * u
     return (
         u2 * u * (10.0 + u * (6.0 * u - 15.0)),

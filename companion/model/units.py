@@ -17,9 +17,7 @@ _WITHOUT: Final = frozenset({"row_weights_s"})
 
 
 def split_unit(name: str, units: dict[str, str] = UNITS) -> tuple[str, str | None]:
-    """Split a name before its longest suffix in `units`: `duration_ms` gives ("duration", "ms"); a name without a unit gives
-    (name, None).
-    """
+    """Split a name before its longest suffix in `units`: `duration_ms` gives ("duration", "ms"), without a unit (name, None)."""
     words = name.split("_")
     for count in (3, 2, 1):
         suffix = "_".join(words[-count:]).lower()

@@ -70,9 +70,7 @@ class TelemetrySession:
     """Builds the messages of one flight and verifies commands.
 
     Args:
-        config: effective configuration.
         session: random id of this flight.
-        simulated: whether the devices are simulated.
         verifier: verifies commands; None if commands are not accepted.
         no_commands: why commands are not accepted.
     """
@@ -121,7 +119,6 @@ class TelemetrySession:
         self._events_sent = -1
         self._changed = {Topic.SCENE, Topic.PREFLIGHT}
         self.refused = 0
-        """Number of refused commands."""
 
     @property
     def session(self) -> str:

@@ -36,9 +36,7 @@ COMMAND_LINE_WORLD = "lab"
 
 
 class SitlConfig(FlightConfig):
-    """A flight's configuration and the true parameters of its simulated world. The flight process and the core receive only
-    `flight`.
-    """
+    """A flight's configuration and the true parameters of its simulated world; flight process and core receive only `flight`."""
 
     world: World = World()
     laboratory: Laboratory = Laboratory()

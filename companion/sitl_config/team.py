@@ -109,11 +109,7 @@ def _of_member(end: End, overrides: Sequence[str]) -> list[str]:
 
 
 def _grips_of(mission: Path, document: Document) -> list[int]:
-    """Return the indices of the phases in which a member grips its end of the bar.
-
-    Raises:
-        ConfigError: the mission cannot be read, or has none.
-    """
+    """Return the indices of a member's phases of type grip; raises ConfigError if the mission is unreadable or has none."""
     phases = read_document(mission).find(("phases",))
     found = [
         index

@@ -54,8 +54,6 @@ class Px4Stub:
 
     Args:
         params: parameter store; changes take effect at once.
-        estimator: substitute for EKF2.
-        cascade: attitude loop, rate loop and mixer.
         setpoint_delay_s: delay from the arrival of a setpoint to its effect in the attitude loop.
         learned: biases that PX4 has learned before the world starts; None for an IMU without bias.
     """
@@ -242,9 +240,7 @@ class Px4Stub:
         self.clock_ahead_s = self.since_sample_s = 0.0
 
     def pilot_sets_mode(self, state: NavState) -> None:
-        """Change the mode as the mode switch of a pilot's radio does; set the origin and the home position first if they are not
-        known.
-        """
+        """Change the mode as a pilot's mode switch does; set origin and home position first if they are not known."""
         estimate = self.estimate
         if estimate is None:
             return

@@ -119,7 +119,6 @@ def stub_of(config: WorldConfig, airframe: Airframe, link_delay_s: float = 0.0) 
 
     Args:
         config: configuration of the world; `setpoint_delay_s`, `thr_mdl_fac`, `px4_params` and the biases of `imu` are used.
-        airframe: airframe of the vehicle file, for the layout of the rotors.
         link_delay_s: added to the setpoint delay, for a loop without a real link.
     """
     params = Params()

@@ -134,9 +134,7 @@ class FastFlight:
     def run(
         self, limit_s: float = 90.0, until_mission_s: float = math.inf, until: Callable[[Outputs], bool] | None = None
     ) -> FastResult:
-        """Fly until the mission ends, the vehicle crashes, world time reaches `limit_s`, the mission's clock `until_mission_s`, or
-        `until` returns True for a tick's outputs.
-        """
+        """Fly until the mission ends, a crash, world time `limit_s`, mission time `until_mission_s`, or `until` is True of a tick."""
         result = FastResult()
         with garbage_collection_paused():
             for _ in self.ticks(result, limit_s, until_mission_s, until):
@@ -168,9 +166,7 @@ class FastFlight:
         until_mission_s: float = math.inf,
         until: Callable[[Outputs], bool] | None = None,
     ) -> None:
-        """Begin the flight whose record is `result`; the arguments are those of `run`. From then on, call `Plant.act`, a step of the
-        scene and `after_step`, until the flight is over.
-        """
+        """Begin the flight recorded in `result`, with the arguments of `run`; then call `Plant.act`, the scene, `after_step`."""
         result.layout = self.plant.machine.layout
         self._result, self._limit_s, self._until_mission_s, self._until = result, limit_s, until_mission_s, until
 
@@ -289,9 +285,7 @@ class FastFlight:
             self._result.after.append(self.plant.machine.snapshot())
 
     def _flight_process_stalled(self, guardian: FastGuardian) -> bool:
-        """Return whether a fault stops the control ticks of the flight process. If only its event loop is stalled, also do what its bus
-        thread still does.
-        """
+        """Return whether a fault stops the flight process's ticks; if only its event loop stalls, do what its bus thread does."""
         active, t_s = self.faults.active, self.plant.scene.t_s
         guardian.alive = "kill_guardian" not in active
         if "stall_loop" in active:
@@ -368,9 +362,7 @@ class FastFlight:
         )
 
     def announced(self, outputs: Outputs | None) -> TeamState | None:
-        """Return what the vehicle tells its partner after this step: the core in a tick, the guardian while it lands the vehicle; None
-        between ticks and while both are silent.
-        """
+        """Return what the vehicle tells its partner after this step: the core, or a landing guardian; None if there is nothing."""
         if outputs is not None:
             return outputs.team
         guardian, pose = self._guardian, self._mocap.newest

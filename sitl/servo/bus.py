@@ -56,7 +56,6 @@ class ServoLine:
         """Process bytes from the master and return the servos' answer; never raise an exception.
 
         Args:
-            data: any bytes.
             baud_bps: baud rate of the bytes; if None, every servo receives them.
         """
         return self.exchange(data, baud_bps)[0]
@@ -242,7 +241,6 @@ class ServoBus:
     """The servos behind a pty, served by the running event loop.
 
     Args:
-        servos: the servos on the wire.
         page: page of simulated time, on which the bus writes how much it has answered; None in real time. In simulated time the
             transmission takes no time.
         wire_time: delay every answer by the transmission time of request and answer at the line's baud rate and by the return
@@ -324,9 +322,7 @@ class ServoBus:
         self._send(noise)
 
     def answer_to(self, data: bytes, baud_bps: int) -> tuple[bytes, float]:
-        """Return the servos' answer to a request sent at a given baud rate, and their total return delay in s; noise may corrupt
-        the request.
-        """
+        """Return the servos' answer to a request sent at a baud rate, and their return delay, s; noise may corrupt the request."""
         if self.damaged():
             middle = len(data) // 2
             data = data[:middle] + bytes((data[middle] ^ 0x5A,)) + data[middle + 1 :]

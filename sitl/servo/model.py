@@ -131,9 +131,7 @@ class ServoModel:
         self.drive.goal_delay_s = delay_s
 
     def fail_silent(self, silent: bool) -> None:
-        """Break or restore the data wire. While it is broken, the servo neither receives nor answers, and its motor runs on until its
-        watchdog trips.
-        """
+        """Break or restore the data wire: a servo without it neither receives nor answers, and runs on until its watchdog trips."""
         self._silent = silent
 
     def trip_overload(self) -> None:

@@ -33,9 +33,7 @@ class ArmHandling:
         """Return the joint angles to hold now, or None while the servos hold the arm.
 
         Args:
-            t_s: world time.
             limp: whether torque is off on all servos.
-            angle_rad: joint angles.
             lights: number of times that an LED was switched on; each time, the arm is moved to the next pose.
             lit: whether an LED is on.
         """

@@ -25,7 +25,6 @@ class BallMarkers:
     """The markers of each frame that belong to no rigid body; call `frame` once per frame.
 
     Args:
-        config: configuration of the world.
         scene: the scene with the balls; its first machine has the net.
     """
 

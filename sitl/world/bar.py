@@ -75,7 +75,6 @@ class Bar:
     """The bar of a scene; call `step` after each step of the scene.
 
     Args:
-        spec: the bar.
         bodies: the model, as each machine sees it; the first machine has the left end.
         machines: the two machines.
         events: where grips and a fall are reported.

@@ -57,7 +57,6 @@ class Machine:
 
     Args:
         spec: vehicle file, configuration and start pose, at which the machine is put.
-        bodies: the model of the scene.
         events: where contacts and a crash are reported.
         surfaces: the surfaces of the scene, or None.
     """
@@ -129,7 +128,6 @@ class Machine:
         self.q: list[float] = self._qpos.tolist()
         """The machine's qpos; see `layout`."""
         self.v: list[float] = self._qvel.tolist()
-        """The machine's qvel."""
         self._sensors: list[float] | None = None
         """Sensor values, read from MuJoCo on first access; None until then."""
 

@@ -226,9 +226,7 @@ def _base(vehicle: Vehicle, world: World, p: str) -> str:
 
 
 def _balls(world: World) -> tuple[str, str, str]:
-    """Return the bodies of the balls, their contacts with the floor, and the constraints that hold them in the net of the first
-    machine.
-    """
+    """Return the balls' bodies, their contacts with the floor, and the constraints of the first machine's net."""
     bodies = pairs = connect = ""
     balls = [(PAYLOAD, CATCH, world.payload_kg)]
     balls += [(SECOND, SECOND_CATCH, f.magnitude) for f in world.faults if f.kind == "payload_double"][:1]
@@ -253,7 +251,6 @@ def mjcf(machines: Sequence[tuple[Vehicle, World]], timestep_s: float, bar: tupl
     Args:
         machines: vehicle file and configuration of each machine; the configuration of the first has the objects of the scene, and its
             machine catches the payload.
-        timestep_s: physics step.
         bar: body, contacts and constraints of the bar that the machines carry.
     """
     vehicle, world = machines[0]

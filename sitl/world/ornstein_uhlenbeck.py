@@ -14,8 +14,6 @@ class OrnsteinUhlenbeck:
     Args:
         count: number of triples.
         correlation_time_s: time after which the autocorrelation has fallen to 1/e.
-        period_s: time between two samples.
-        seed: seed of the world.
         source: number of the noise sequence.
     """
 

@@ -55,9 +55,6 @@ class Payload:
 
     Args:
         machine: the machine with the net.
-        bodies: the model of the scene, as that machine sees it.
-        vehicle: vehicle file of that machine.
-        config: configuration of the world.
         events: where throws and catches are reported.
     """
 
@@ -106,7 +103,6 @@ class Payload:
         """Throw, catch or remove the payload if that is due in this step.
 
         Args:
-            t_s: world time.
             airborne: whether a payload may be thrown.
         """
         ball, kept_since_s = self.ball, self._kept_since_s
@@ -258,7 +254,6 @@ class Payload:
 
         Args:
             ball: indices of the ball.
-            t_s: world time.
         """
         return self._caught_s(ball, t_s) is not None
 

@@ -37,7 +37,6 @@ class Scene:
         self.model, self.data = model, mujoco.MjData(model)
         self.loads, self._events = Loads(self.data), Events()
         self.surfaces = Surfaces(first.config, model) if first.config.surfaces else None
-        """Surfaces; None if there are none."""
         bodies = tuple(Bodies(model, self.data, self.loads, prefix) for prefix in prefixes)
         self.machines = tuple(
             Machine(spec, each, self._events, self.surfaces) for spec, each in zip(machines, bodies, strict=True)

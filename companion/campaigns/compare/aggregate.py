@@ -193,9 +193,7 @@ def adaptation_pairs(groups: Sequence[Group]) -> list[Pairs]:
 
 
 def pairs_with_reference(groups: Sequence[Group]) -> dict[int, Pairs]:
-    """Return, by `id` of each other group, its pairs with the adaptive law's `recommended`, or with the first variant if that was not
-    flown.
-    """
+    """Return, by `id` of each other group, its pairs with the adaptive law's `recommended`, or else with the first variant."""
     labels = [group.label for group in groups]
     label = REFERENCE if REFERENCE in labels else next(iter(labels), "")
     base = [group for group in groups if group.label == label]

@@ -124,7 +124,6 @@ def fit(samples: Sequence[Sample], vehicle: Vehicle) -> FrictionFit:
 
     Args:
         samples: sweeps of all joints in both directions, at two speeds or more.
-        vehicle: masses, lengths, and the torque constants and friction to compare with.
     """
     count = len(vehicle.arm.joints)
     fits = tuple(fit_joint([one for one in samples if one.joint == joint], vehicle, joint) for joint in range(count))

@@ -139,7 +139,6 @@ def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], Non
     """Write the planned settings to one servo after the other.
 
     Args:
-        plans: plans from one scan.
         report: called with a line for each value that is written.
 
     Raises:

@@ -123,9 +123,7 @@ def _refuse_armed(link: LatencyLink, address: str) -> None:
 
 
 async def _tapped(session: Session, link: LatencyLink, clock: Clock, poses: list[MocapPose]) -> tuple[TapDelay, ...]:
-    """Return all taps once enough are usable or time is up. During the session taps are only counted, because computing on
-    the event loop would delay the time stamps of motion capture.
-    """
+    """Return all taps once enough are usable or time is up; meanwhile only count: computing would delay mocap's stamps."""
     end_s, from_s, wanted = clock() + session.arguments.seconds, clock(), session.arguments.taps
     done: list[TapDelay] = []
     missing = wanted

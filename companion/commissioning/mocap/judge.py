@@ -114,9 +114,7 @@ class Timing:
 
 
 def timing(frames: Sequence[FrameSeen]) -> Timing | None:
-    """Return the regularity of the arrivals, from a least-squares fit of arrival time over frame number; None if there are fewer
-    than 10 frames or the frame number does not advance.
-    """
+    """Return the regularity of arrivals, by a fit of arrival time over frame number; None for fewer than 10 or repeated frames."""
     if len(frames) < 10 or frames[-1].number <= frames[0].number:
         return None
     n = [frame.number - frames[0].number for frame in frames]

@@ -87,9 +87,7 @@ class Refused:
     text: str
     """One printable line for the operator; may quote the payload."""
     command: Command | None = None
-    """The command if its signature is valid and an `Ack` is to be sent. None if the sender is unknown, the command is a copy of an
-    answered one, or the limit `ACKS_PER_S` is reached.
-    """
+    """The command if signed and to be answered by an `Ack`: not from an unknown sender, not a copy, below `ACKS_PER_S`."""
 
 
 Verdict: TypeAlias = Accepted | Refused
@@ -220,9 +218,7 @@ class _History:
 
 
 class Verifier:
-    """Verifies messages of the vehicle's ``command`` topic. No I/O and no clock; it keeps a history of the commands that it has
-    verified.
-    """
+    """Verifies messages of the vehicle's ``command`` topic, of which it keeps a history. No I/O and no clock."""
 
     def __init__(self, operators: Operators, vehicle: str, session: str) -> None:
         self.operators = operators

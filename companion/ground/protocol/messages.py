@@ -261,9 +261,7 @@ class Timing(Record, frozen=True, kw_only=True):
 
 
 class Stream(Record, frozen=True, kw_only=True):
-    """Message on topic ``stream``, published at 20 Hz. Position and attitude come from motion capture, or from PX4 while motion
-    capture is lost.
-    """
+    """Message on topic ``stream``, published at 20 Hz, with the pose from motion capture, or from PX4 while that is lost."""
 
     v: int
     session: str

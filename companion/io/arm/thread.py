@@ -62,9 +62,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
 
     Args:
         where: device and address, for errors.
-        watchdog_ms: timeout of the watchdogs.
         limp: goal without torque.
-        clock: the flight clock, source of all stamps.
     """
 
     writes_at_once: ClassVar[bool] = False
@@ -293,11 +291,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
 
     @abstractmethod
     def _open_bus(self) -> None:
-        """Open the bus, check the arm and switch its torque on, with torque 0.
-
-        Raises:
-            DeviceError: the arm does not meet the requirements.
-        """
+        """Open the bus, check the arm and switch its torque on, with torque 0; raises DeviceError if it fails a requirement."""
 
     @abstractmethod
     def _read_bus(self) -> Answer | None:

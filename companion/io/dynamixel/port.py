@@ -181,9 +181,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
 
 
 class SimulatedPort(ServoPort):
-    """Serial port to the servo bus in simulated time, which stands while a reply is on its way: a reply is missing once the world has
-    answered everything that was written.
-    """
+    """Serial port to the servo bus in simulated time: a reply is missing once the world has answered all that was written."""
 
     def __init__(self, port_name: str | None, simulated: SimulatedTime) -> None:
         super().__init__(port_name)

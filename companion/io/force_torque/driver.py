@@ -37,8 +37,6 @@ class RobotousForceTorque(SampleStream):
     `latest()` becomes stale and nothing is raised. A port that comes back under its name is opened again by `latest()`.
 
     Args:
-        device: port, rate and the force above which a sample counts as overloaded.
-        clock: the flight clock.
         answer_timeout_s: timeout for each reply of the sensor, and for the first samples.
     """
 
@@ -156,9 +154,7 @@ class RobotousForceTorque(SampleStream):
         return rft.RATE_CODES.get((await self._ask(Command.GET_RATE))[1])
 
     async def _ask(self, command: Command, parameter: int = 0, repeat_s: float | None = None) -> bytes:
-        """Send one request and return its reply. The first request is repeated, because half a command from an earlier run may be
-        in the sensor's buffer and corrupt the request.
-        """
+        """Send one request and return its reply. The first one is repeated: half a command from before may corrupt it."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + self._answer_timeout_s
         answer: asyncio.Future[bytes] = loop.create_future()

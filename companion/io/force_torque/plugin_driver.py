@@ -38,8 +38,6 @@ class PluginForceTorque(SampleStream):
     An invalid reading is dropped and counted. When `read` raises or no longer returns, `latest()` becomes stale and nothing is raised.
 
     Args:
-        device: `devices.force` of the vehicle file.
-        clock: the flight clock.
         first_timeout_s: timeout for the first samples.
     """
 

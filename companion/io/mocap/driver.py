@@ -47,8 +47,6 @@ class MocapDriver:
     the newest is delivered. Without poses the safety rules land the vehicle.
 
     Args:
-        device: `devices.mocap` of the vehicle file.
-        clock: the flight clock.
         on_pose: called with every new pose; an exception is logged once and never stops the reception.
         connect_timeout_s: timeout for the server's answer.
         body_timeout_s: timeout for the first pose in which the body is tracked.

@@ -25,8 +25,6 @@ class Questions:
 
     Args:
         address: as in `devices.autopilot.address`, for errors.
-        system_id: PX4's.
-        inbox: receives the answers.
         send: sends a message, given by id and payload.
     """
 

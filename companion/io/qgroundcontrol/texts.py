@@ -72,9 +72,7 @@ def values(inputs: Inputs, outputs: Outputs) -> dict[str, float]:
 
 
 class Texts:
-    """STATUSTEXTs at a rate that suits a slow link: bursts of 10, then 5 per second, the most severe first. Dropped texts are
-    counted and reported.
-    """
+    """STATUSTEXTs at a rate for slow links: bursts of 10, then 5 per second, most severe first; dropped ones are counted."""
 
     def __init__(self) -> None:
         self._waiting: deque[Text] = deque()
@@ -102,9 +100,7 @@ class Texts:
         return messages
 
     def _chunks(self, severity: int, text: str) -> list[Any]:
-        """Return one message, or several with a common id other than 0. A text that fills its last chunk is followed by an
-        empty one.
-        """
+        """Return one message, or several with a common id other than 0; a text that fills its last chunk gets an empty one."""
         data = "".join(c if c.isascii() and c.isprintable() else "?" for c in " ".join(text.split())).encode()
         if len(data) > TEXT_MAX_BYTES:
             data = data[: TEXT_MAX_BYTES - 3] + b"..."
@@ -127,9 +123,7 @@ def value_messages(time_boot_ms: int, named: Mapping[str, float]) -> list[Any]:
 
 
 def heartbeat_message() -> Any:
-    """Return a HEARTBEAT with MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID and MAV_STATE_ACTIVE, so that ground stations do not
-    show the companion as a vehicle.
-    """
+    """Return a HEARTBEAT of an onboard controller that is no autopilot, so that ground stations show no second vehicle."""
     return mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
     )

@@ -76,10 +76,7 @@ class TetherLine:
     """The slack tether.
 
     Args:
-        config: section `tether_line`.
-        tether: tether of the vehicle file.
         taut: that tether in the model, which knows its attachment and present length.
-        bodies: the model of the scene.
     """
 
     def __init__(self, config: TetherLineConfig, tether: Tether, taut: TautTether, bodies: Bodies) -> None:
