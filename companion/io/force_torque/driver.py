@@ -28,6 +28,7 @@ _REPEAT_S: Final = 0.4
 _FIRST_SAMPLES: Final = 5
 _READ_BYTES: Final = 4096
 _MODEL: Final = "RFT60"
+_ON_THEIR_WAY_S: Final = 0.2
 
 
 class RobotousForceTorque(SampleStream):
@@ -78,6 +79,17 @@ class RobotousForceTorque(SampleStream):
             bad_sums=self._scanner.bad_sums,
             lost=self._lost,
         )
+
+    async def set_bias(self, on: bool) -> None:
+        """Set the sensor's own zero to the current reading (SET_BIAS 1) or clear it (0), and drop the samples in transit.
+
+        No flight uses it. The sensor does not acknowledge the command; check its reading.
+
+        Raises:
+            DeviceError: the sensor stopped sending.
+        """
+        self._send(Command.SET_BIAS, int(on))
+        await self.tare_samples(_ON_THEIR_WAY_S)
 
     async def __aenter__(self) -> Self:
         """Open the port, identify the sensor, set its rate, start continuous output, wait for the first samples.
