@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeAlias
 
-from companion.model.types import Joints, Reference, Vec3
+from companion.model.types import Reference
 
 Shape: TypeAlias = tuple[float, float, float, float]
 """f, f', f'', f''' of a profile at u in [0, 1]."""
@@ -206,21 +206,4 @@ def reference_at(position: Track, yaw: Track, arm: Track, t_s: float) -> Referen
         arm_rate_rad_s=arm_rate_rad_s,
         arm_acceleration_rad_s2=arm_acceleration_rad_s2,
         jerk_world_m_s3=(jx, jy, jz),
-    )
-
-
-def at_rest(position_world_m: Vec3, yaw_rad: float, arm_rad: Joints) -> Reference:
-    """Return a constant reference."""
-    zero3: Vec3 = (0.0, 0.0, 0.0)
-    still = (0.0,) * len(arm_rad)
-    return Reference(
-        position_world_m=position_world_m,
-        velocity_world_m_s=zero3,
-        acceleration_world_m_s2=zero3,
-        yaw_rad=yaw_rad,
-        yaw_rate_rad_s=0.0,
-        arm_rad=arm_rad,
-        arm_rate_rad_s=still,
-        arm_acceleration_rad_s2=still,
-        jerk_world_m_s3=zero3,
     )

@@ -92,7 +92,6 @@ class Bar:
         half_m = 0.5 * spec.length_m
         self._handles: tuple[Vec3, Vec3] = ((half_m, 0.0, 0.0), (-half_m, 0.0, 0.0))
         self._tips = [data.xpos[each.body("tip")] for each in bodies]
-        self._tip_axes = [data.xmat[each.body("tip")] for each in bodies]
         self._clamps = [model.equality(f"{each.prefix}clamp").id for each in bodies]
         self.gripped = [False, False]
         """Whether each machine's clamp holds its handle."""

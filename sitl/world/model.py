@@ -15,7 +15,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.arm_chain import TOOL_PART_INERTIA_KG_M2, ChainLink
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.model.types import IDENTITY_QUAT, Joints, Quat, Vec3
+from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 from companion.sitl_config.effects.rotors import of_rotors
 from companion.sitl_config.world import World
 from sitl.world import surfaces
@@ -41,11 +41,6 @@ def base_mass_kg(vehicle: Vehicle, world: World) -> float:
     if tool is not None:
         rest = rest + tool.sensor_mass_kg + tool.beyond_sensor_kg
     return (vehicle.airframe.mass_kg - rest) * (1.0 + world.mass_error)
-
-
-def link_masses_kg(vehicle: Vehicle, world: World) -> Joints:
-    """Return the true masses of the links, without sensor and net, whose masses in the vehicle file are taken as true."""
-    return tuple(link.mass_kg for link in machine.true_chain(vehicle, world).links)
 
 
 def _xyz(values: Vec3) -> str:

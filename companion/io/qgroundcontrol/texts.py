@@ -23,8 +23,6 @@ TEXT_MAX_BYTES = 4 * TEXT_BYTES
 TEXT_RATE_HZ = 5.0
 TEXT_BURST = 10
 TEXTS_WAITING_MAX = 20
-VALUE_NAMES = ("slack_m", "stop_slk_m", "e_p_m", "e_q_deg", "rho", "payload_kg", "progress")
-"""Values of NAMED_VALUE_FLOAT.name, 10 characters at most."""
 
 _CRITICAL, _WARNING, _NOTICE, _INFO = 2, 4, 5, 6
 _SEVERITIES = {Severity.INFO: _INFO, Severity.WARNING: _WARNING, Severity.CRITICAL: _CRITICAL}
@@ -53,7 +51,7 @@ def outcome_text(outcome: Outcome) -> Text:
 
 
 def values(inputs: Inputs, outputs: Outputs) -> dict[str, float]:
-    """Return the known values by their names in `VALUE_NAMES`.
+    """Return the known values by their names for NAMED_VALUE_FLOAT, of 10 characters at most.
 
     The tether's slack, the slack at the stopping position and the position error are in m, the angle between attitude and setpoint in
     deg, masses in kg, progress from 0 to 1; rho is that of the control law.
