@@ -93,7 +93,8 @@ class TelemetrySession:
         """CLOCK_MONOTONIC of the newest tick."""
         self._new_ticks = False
         self._outcome: Outcome | None = None
-        self._over = False
+        self.over = False
+        """Whether the flight has ended."""
         self._packet_error: str | None = None
         """Error of the first malformed packet (a bug); empty once it has been reported."""
         self._refusals: dict[str, _Refusals] = {}
@@ -129,11 +130,6 @@ class TelemetrySession:
     def accepts_commands(self) -> bool:
         """Whether commands are verified and forwarded."""
         return self._verifier is not None
-
-    @property
-    def over(self) -> bool:
-        """Whether the flight has ended."""
-        return self._over
 
     def flight_s(self, now_s: float) -> float | None:
         """Return the flight clock at a CLOCK_MONOTONIC time, or None before the first tick."""
@@ -176,7 +172,7 @@ class TelemetrySession:
 
     def receive_command(self, payload: bytes, retained: bool, now_s: float) -> Command | None:
         """Verify a payload of the command topic; return the command if it is accepted."""
-        if self._verifier is None or self._over:
+        if self._verifier is None or self.over:
             return None
         verdict = self._verifier.check(payload, retained, self.flight_s(now_s))
         if isinstance(verdict, Accepted):
@@ -203,9 +199,9 @@ class TelemetrySession:
         Args:
             normally: True if the flight ended normally, False if its process died.
         """
-        if self._over:
+        if self.over:
             return
-        self._over = True
+        self.over = True
         outcome = self._outcome.value if self._outcome is not None else None
         if normally:
             self._set_state(presence=Presence.ENDED, commands=False, outcome=outcome, text=None)
@@ -268,7 +264,6 @@ class TelemetrySession:
         )  # fmt: skip
 
     def _proven(self, ack: Ack) -> Ack:
-        """Return the ack with a proof for the operator who sent the command."""
         key = self._verifier.operators.find_key(ack.operator) if self._verifier is not None else None
         return ack if key is None else with_proof(ack, self.vehicle, key)
 
@@ -286,7 +281,7 @@ class TelemetrySession:
             self._changed.add(Topic.PREFLIGHT)
 
     def _presence(self, now_s: float) -> None:
-        if self._over:
+        if self.over:
             return
         if self._tick_s is None:
             self._tick_s = now_s  # first call: ticks are expected from now on

@@ -97,7 +97,8 @@ class ServoModel:
         self.lights = 0
         """Number of times that the LED has been switched on."""
         self._shutdown = False
-        self._silent = False
+        self.silent = False
+        """Whether the data wire is broken."""
         self._power_on()
 
     # --- side of the world -------------------------------------------------------------------------------------------
@@ -132,7 +133,7 @@ class ServoModel:
 
     def fail_silent(self, silent: bool) -> None:
         """Break or restore the data wire: a servo without it neither receives nor answers, and runs on until its watchdog trips."""
-        self._silent = silent
+        self.silent = silent
 
     def trip_overload(self) -> None:
         """Raise the overload error, as the servo does after holding too large a load."""
@@ -189,11 +190,6 @@ class ServoModel:
     def status_return_level(self) -> int:
         """Status return level (register 68): with 0 the servo answers only pings, with 1 also reads, with 2 every instruction."""
         return self._memory[68]
-
-    @property
-    def silent(self) -> bool:
-        """Whether the data wire is broken."""
-        return self._silent
 
     @property
     def alert(self) -> int:
@@ -258,7 +254,6 @@ class ServoModel:
         return address
 
     def _checked(self, address: int, data: bytes) -> list[tuple[Register, int]]:
-        """Split `data` into writes of single registers and check that each of them is allowed."""
         if not data:
             raise ServoRefusal(StatusError.DATA_LENGTH)
         targets = [self._resolve(address + i, StatusError.ACCESS) for i in range(len(data))]
@@ -359,7 +354,6 @@ class ServoModel:
             drive.start_watchdog(watchdog * WATCHDOG_UNIT_S if watchdog else None)
 
     def _show_present(self) -> None:
-        """Copy the drive's present values into the table."""
         memory = self._memory
         # One assignment, so that a read never mixes values of two moments.
         current, velocity, position = self.drive.present()
