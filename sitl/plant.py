@@ -72,7 +72,6 @@ class _JointServo(NamedTuple):
 
 
 def _zero_rad(joint: Joint, servo: Servo) -> float:
-    """Return the shaft angle at joint angle 0."""
     return joint.zero_count / _COUNTS_PER_RAD + joint.sign * math.radians(servo.zero_error_deg)
 
 

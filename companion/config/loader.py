@@ -243,7 +243,6 @@ def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
 
 
 def _check_controller(document: Document, overrides: list[Override], lines: list[str]) -> ControllerConfig | None:
-    """Apply the overrides to a controller file and validate it with the model of its law."""
     _override(document, "controller", overrides, lines)
     law = document.find(("law",))
     if isinstance(law, str) and law in LAWS:

@@ -198,7 +198,6 @@ async def _is_armed(autopilot: Autopilot) -> bool:
 
 
 def _force(config: FlightConfig, clock: Clock) -> ForceTorque | None:
-    """Return the driver of the force sensor, or None if the vehicle has none."""
     device = config.vehicle.devices.force
     return open_force(device, clock) if device is not None else None
 
@@ -228,7 +227,6 @@ def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> M
 
 
 def _team(config: FlightConfig, clock: Clock) -> TeamLink | None:
-    """Return the link to the other vehicle, or None if the vehicle flies alone."""
     device = config.vehicle.devices.team
     return None if device is None else TeamLink(TeamSettings(**device.model_dump()), clock)
 
@@ -256,6 +254,5 @@ def open_arm(device: ArmDevice, arm: ArmConfig, clock: Clock, jaws: Jaws | None 
 
 
 def _arm(config: FlightConfig, clock: Clock) -> Arm | None:
-    """Return the driver of the arm, or None if the vehicle has none."""
     vehicle = config.vehicle
     return open_arm(vehicle.arm_device, vehicle.arm, clock, vehicle.jaws) if vehicle.arm.joints else None

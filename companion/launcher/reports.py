@@ -124,7 +124,6 @@ class FlightReports:
 
 
 def _takeover_summary(guardian: GuardianProcess, code: int, log_path: Path) -> str:
-    """Return one line on how the flight process and the flight ended."""
     vehicle = {
         Outcome.ABORTED: "the guardian landed the vehicle",
         Outcome.CRASHED: "the vehicle was flipped or tipped over, and the guardian stopped its rotors",

@@ -144,7 +144,6 @@ def check_start(
 
 
 def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, arm_rad: Joints | None) -> Iterator[str]:
-    """Check the vehicle's position, yaw and arm against the mission's start."""
     start = mission.start
     x_m, y_m = start.position_m
     away_m = math.dist(position[:2], start.position_m)
@@ -187,7 +186,6 @@ def _speed(mission: Mission, vehicle: Vehicle) -> Iterator[str]:
 
 
 def _of_phases(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequence[str]) -> Iterator[str]:
-    """Check what each type of phase needs."""
     phases = phases_of(mission)
     for segment in plan.segments:
         if segment.repetition < 2:

@@ -149,7 +149,6 @@ class Uplink:
             staying.cancel()
 
     async def _pump(self) -> None:
-        """Process packets and build messages, 20 times a second."""
         due_s = time.monotonic()
         while True:
             ending = self._recorder.ending()

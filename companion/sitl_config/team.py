@@ -103,7 +103,6 @@ def load_team(
 
 
 def _of_member(end: End, overrides: Sequence[str]) -> list[str]:
-    """Return the options that hold for a member."""
     named = [(text.lstrip().partition("."), text) for text in overrides]
     return [rest if head in ENDS else text for (head, _, rest), text in named if head not in ENDS or head == end]
 
@@ -128,7 +127,6 @@ def _grips_of(mission: Path, document: Document) -> list[int]:
 def _overrides_of(
     team: str, end: End, member: Member, document: Document, grips: Sequence[int]
 ) -> Iterator[str | Override]:
-    """Yield what a member has of its own."""
     at = document.origin(("members", end))
     for index in grips:
         yield override_of(f"mission.phases[{index}].end", end, at)

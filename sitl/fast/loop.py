@@ -230,7 +230,6 @@ class FastFlight:
         return outputs
 
     def _receive(self) -> None:
-        """Let motion capture and PX4 send what is due after a step."""
         plant = self.plant
         if plant.faults is not None:
             self._bus.step(plant.scene.t_s)
@@ -259,7 +258,6 @@ class FastFlight:
         result.miss_m = scene.payload.miss_m
 
     def _sample_force(self) -> None:
-        """Take a sample of the force sensor, which the next tick reads."""
         force_n, torque_nm = self.plant.force_torque()
         if self.plant.fault("force_loss") is not None:
             return
@@ -271,7 +269,6 @@ class FastFlight:
         return self.px4.armed and not self.plant.machine.crashed and self.plant.scene.t_s < self._settles_until_s
 
     def _settle(self) -> None:
-        """Let PX4 finish the landing of a flight that has ended in the air."""
         if self._external:
             self._poses_for_guardian()
         self._record_landing()
@@ -279,7 +276,6 @@ class FastFlight:
             self._over()
 
     def _record_landing(self) -> None:
-        """Record the state of the world, if that is due."""
         if self.plant.scene.t_s >= self._lands_s + TICK_PERIOD_S - 1e-9:
             self._lands_s += TICK_PERIOD_S
             self._result.after.append(self.plant.machine.snapshot())

@@ -233,7 +233,6 @@ class Faults:
         self._machine.wind_m_s = (wx + speed_m_s * x / away_m, wy + speed_m_s * y / away_m, wz)
 
     def _shut_down_servo(self, index: int, error: int) -> None:
-        """Shut a servo down as its own protection would."""
         if self._servos and error == OVERLOAD:
             self._servos[index].trip_overload()
         elif not self._servos:

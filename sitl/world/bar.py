@@ -151,7 +151,6 @@ class Bar:
         self._events.report(t_s, "bar_let_go")
 
     def _slips(self, number: int) -> bool:
-        """Return whether the handle is pulled out of the jaws."""
         force = self.pull_n(number)
         return force > self._strength_n
 

@@ -100,7 +100,6 @@ def _links(vehicle: Vehicle, world: World, prefix: str) -> str:
 
 
 def _rod(vehicle: Vehicle, tool: Tool) -> str:
-    """Return the inertia of a rod in the frame of the force-torque sensor."""
     half_m, moments = rod_of(tool)
     back = quat_conjugate(surfaces.sensor_turn(vehicle))
     centre_m = quat_rotate(back, (half_m, 0.0, 0.0))

@@ -141,7 +141,6 @@ class Payload:
                 self._await_throw()
 
     def _is_due(self, t_s: float) -> bool:
-        """Return whether the person throws in this step."""
         q, (at_x, at_y) = self._machine.q, self._config.catch_at_m
         if self._config.throw_to == "hovering":
             near = q[2] > self._high_m and math.hypot(q[0] - at_x, q[1] - at_y) <= _HOVERS_WITHIN_M
@@ -203,7 +202,6 @@ class Payload:
         self._events.report(t_s, "thrown")
 
     def _take_out(self, ball: Ball, t_s: float) -> None:
-        """Take the payload out of the net, so that it can be thrown again."""
         d = self._data
         self.drop()
         self._kept_since_s = None

@@ -258,7 +258,6 @@ def _each(servos: Sequence[FoundServo], texts: Sequence[str]) -> str:
 
 
 def _found(found: Scan, judged: Judgement) -> list[dict[str, Any]]:
-    """Return the data of each servo, with the number of its joint."""
     joints = {id(servo): index + 1 for index, servo in enumerate(judged.assignment.joints) if servo is not None}
     return [{**servo.as_json(), "joint": joints.get(id(servo))} for servo in found.servos]
 

@@ -164,7 +164,6 @@ async def _count(
 
 
 def _max_ms(vehicle: Vehicle) -> float:
-    """Return the largest delay that the preflight accepts."""
     limits = next(one.limits_for(vehicle) for one in WANTED if one.name == PARAMETER)
     return math.inf if limits is None else limits[1]
 

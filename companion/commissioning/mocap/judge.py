@@ -343,7 +343,6 @@ def text(watched: Watched) -> list[str]:
 
 
 def _marker_counts(frames: Sequence[FrameSeen]) -> tuple[int, int]:
-    """Return the smallest and largest number of single markers in a frame."""
     counts = [len(frame.markers.markers) for frame in frames if frame.markers is not None] or [0]
     return min(counts), max(counts)
 

@@ -337,5 +337,4 @@ def _parsed(payload: bytes) -> Command | Refused:
 
 
 def _shown(text: str) -> str:
-    """Return the text shortened and without unprintable characters."""
     return text.encode("ascii", "backslashreplace").decode("ascii")[:_TEXT_MAX]

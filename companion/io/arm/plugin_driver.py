@@ -89,7 +89,6 @@ class PluginArm(ThreadedArm[tuple[MotorState, ...], Joints]):
         self._statement = ArmStatement(product, f"{watchdog}, after {watchdog_ms:g} ms")
 
     def _trial_s(self) -> float:
-        """Return the duration of one cycle with torque 0."""
         began_s = time.monotonic()
         self._write_bus(self._limp)
         self._read_bus()

@@ -236,7 +236,6 @@ def servo_port(port_name: str | None) -> ServoPort:
 
 
 def _open_failure(port: str, error: Exception) -> str:
-    """Return the reason why a port did not open, and the remedy, in one line."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT or not Path(port).exists():
         found = sorted(p.device for p in list_ports.comports())

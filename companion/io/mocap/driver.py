@@ -260,7 +260,6 @@ class MocapDriver:
 
 
 def _is_address(server: str) -> bool:
-    """Return whether the server is given as an IPv4 address, not as a name."""
     try:
         return bool(socket.inet_aton(server))
     except OSError:

@@ -329,7 +329,6 @@ class MavsdkAutopilot:
             self._send_message(*messages.command_long(messages.REQUEST_MESSAGE, heartbeat, 0.0, self._system_id))
 
     def _pump(self) -> None:
-        """Read the link regularly while the flight loop does not."""
         assert self._loop is not None
         idle = self._traffic is not None and self._clock() - self._traffic.polled_s > 1.5 * _PUMP_S
         if idle:

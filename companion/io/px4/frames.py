@@ -75,7 +75,6 @@ class Frame:
 
     @property
     def _end(self) -> int:
-        """Return the end of the payload."""
         return len(self.data) - (_SIGNATURE_BYTES if self.signed else 0) - _CHECKSUM_BYTES
 
 

@@ -174,7 +174,6 @@ class Relay:
 
 
 def _received(source: socket.socket) -> list[bytes]:
-    """Return the waiting datagrams, up to one round's limit."""
     datagrams = []
     for _ in range(_ROUND_DATAGRAMS):
         try:

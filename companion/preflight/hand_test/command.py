@@ -141,7 +141,6 @@ class _StampClock:
 
 @contextlib.contextmanager
 def _interrupted(stop: asyncio.Event) -> Iterator[None]:
-    """Set the event on Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -155,7 +154,6 @@ def _interrupted(stop: asyncio.Event) -> Iterator[None]:
 
 
 def _show(bars: Bars, view: HandView) -> None:
-    """Show the step, its progress, and why the last attempt did not count."""
     number = f"{_STEPS.index(view.step) + 1}/{len(_STEPS)}" if view.step in _STEPS else "   "
     bars.say(
         f"   {view.notice}" if view.notice else f"{number}  {INSTRUCTIONS[view.step]}", "yellow" if view.notice else ""
