@@ -335,9 +335,9 @@ class _Robot:
                 text = file.read(SIZE_MAX_BYTES + 1)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-            raise ConfigError([f"{self._shown}: not readable: {reason}"]) from None
+            raise ConfigError(f"{self._shown}: not readable: {reason}") from None
         if len(text) > SIZE_MAX_BYTES:
-            raise ConfigError([f"{self._shown}: larger than {SIZE_MAX_BYTES // 1024} KiB; expected a URDF file"])
+            raise ConfigError(f"{self._shown}: larger than {SIZE_MAX_BYTES // 1024} KiB; expected a URDF file")
         return text
 
     def _parse(self, text: bytes) -> _Element:
@@ -373,7 +373,7 @@ class _Robot:
     def _fail(self, at: _Element | str, text: str) -> NoReturn:
         """Refuse the file, given an element or line and column."""
         position = at if isinstance(at, str) else at.position
-        raise ConfigError([f"{self._shown}:{position}: {text}"])
+        raise ConfigError(f"{self._shown}:{position}: {text}")
 
 
 def _compose(first: _Pose, second: _Pose) -> _Pose:

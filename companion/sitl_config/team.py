@@ -117,9 +117,7 @@ def _grips_of(mission: Path, document: Document) -> list[int]:
     ]
     if not found:
         raise ConfigError(
-            [
-                f"{document.origin(('mission',))}: mission: {mission} has no phase of type grip, so that no team is needed"
-            ]
+            f"{document.origin(('mission',))}: mission: {mission} has no phase of type grip, so that no team is needed"
         )
     return found
 
