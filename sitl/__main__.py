@@ -75,7 +75,6 @@ class _Member:
     """Descriptors from which it reads what the launcher says, and to which it writes."""
     time: MachineTime | None
     px4_folder: Path | None
-    """Folder of its real PX4; None for the stub."""
 
     def send(self, message: WorldMessage) -> None:
         """Send a message to the launcher."""

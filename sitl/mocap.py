@@ -57,7 +57,6 @@ class Mocap:
         self._noise_rad = math.radians(config.mocap_noise_deg)
         self._seed_noise()
         self.faults: Faults | None = None
-        """Faults of this world; None if there are none."""
         self._queue: deque[tuple[float, MocapFrame]] = deque()
         """Frames on their way, each with the world time at which it arrives."""
         self._next_s = 0.0

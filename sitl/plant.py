@@ -161,7 +161,6 @@ class Plant:
         self._imu_sample: ImuSample | None = None
         self.armed_t_s: float | None = None
         self.faults: Faults | None = None
-        """Faults of this world; None if there are none."""
 
     def _seed_noise(self) -> None:
         """Start one noise sequence per sensor. The sequences restart at arming, so that the noise in flight depends only on the seed,

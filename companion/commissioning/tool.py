@@ -94,7 +94,6 @@ class Session:
         self.arguments = arguments
         self.vehicle = load_vehicle(arguments.vehicle, arguments.overrides)
         self.console = console_on(sys.stderr if family.guides_on_stderr or arguments.json else sys.stdout)
-        """Console for instructions and progress."""
 
     def say(self, text: str, style: str = "") -> None:
         """Print one line of instructions."""

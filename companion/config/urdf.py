@@ -103,7 +103,6 @@ class _Robot:
         self._root = root
         self._links: dict[str, _Element] = {}
         self._joints: dict[str, list[_Joint]] = {}
-        """Joints by parent link."""
         self._check_words(root)
         for element in root.children:
             if element.tag == "link":

@@ -27,7 +27,6 @@ class Dropped(NamedTuple):
 
     asked: GroundCommand
     why: str
-    """Reason for the operator."""
 
 
 class TickCommand(NamedTuple):

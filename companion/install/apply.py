@@ -37,9 +37,7 @@ class Changes:
     """Changes that an installation makes."""
 
     entries: Mapping[str, Entry]
-    """All entries of the record, by path."""
     now: Mapping[str, PathState]
-    """Current content of each path."""
     folders: tuple[str, ...]
     """Folders to create, outermost first."""
 

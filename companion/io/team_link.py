@@ -128,7 +128,6 @@ class TeamLink:
         self._simulated = simulated_time.current()
         self._counts = LinkCounts()
         self._counter = -1
-        """Counter of the newest datagram."""
         self._arriving: list[PartnerState] = []
         """Announcements in the order of their arrival, the newest last; those of the future have not arrived yet."""
         self._newest: PartnerState | None = None

@@ -113,7 +113,6 @@ class Launcher:
         self._speed = speed if sitl is not None else None
         self._world = world
         self._time: SharedTime | None = None
-        """Simulated time; None in real time."""
         self._flown_from: tuple[float, float] | None = None
         """Simulated time and wall time of the first status message."""
         self._pace: float | None = None

@@ -54,7 +54,6 @@ class Expectation(Record, frozen=True):
     chase: ChaseState | None = None
     """The way to a thrown ball, for the log."""
     clamp: ClampCommand | None = None
-    """Command for the clamp; None to leave it as it is."""
     grip: Grip = Grip.FREE
     """What the vehicle has in its clamp, for the other vehicle of a team."""
     together: Together = Together()

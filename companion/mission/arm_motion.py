@@ -40,7 +40,6 @@ class JerkLimited:
     """A profile from 0 at u = 0 to 1 at u = 1, at rest at both ends, made of consecutive cubics; implements `Profile`."""
 
     knots: tuple[float, ...]
-    """Start of each cubic."""
     cubics: tuple[tuple[float, float, float, float], ...]
     """f, f', f'' / 2, f''' / 6 at the start of each cubic."""
 

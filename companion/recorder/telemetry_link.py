@@ -30,7 +30,6 @@ from companion.recorder.telemetry_session import INFO, WARNING, Outgoing, Teleme
 from companion.runtime.tasks import until_first
 
 ANSWER_S = 4.0
-"""Timeout for each answer of the broker."""
 COMMAND_PACKET_MAX_BYTES = 16_384
 """Maximum Packet Size given to the broker: sixteen times a command, so that a somewhat oversized command is received and reported."""
 SEND_BUFFER_BYTES = 65_536

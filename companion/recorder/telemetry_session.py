@@ -49,7 +49,6 @@ class _Refusals:
     """Refused commands with the same reason."""
 
     count: int = 0
-    """Refusals that have not been reported."""
     text: str = ""
     reported_s: float = -math.inf
 
@@ -59,7 +58,6 @@ class Outgoing:
     """Messages to send now."""
 
     retained: dict[Topic, bytes] = field(default_factory=dict)
-    """Payload of each retained topic that changed."""
     acks: list[bytes] = field(default_factory=list)
     stream: bytes | None = None
     log: list[tuple[float, str, str]] = field(default_factory=list)

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
 GRANT: Final = struct.Struct("<Q")
-"""Number of the grant."""
 REPORT: Final = struct.Struct("<QdQB")
 """Number of the newest grant, `wake_s`, bytes written to the servo bus, `Flags`."""
 _PAGE_BYTES: Final = 24

@@ -20,7 +20,6 @@ from companion.sitl_config.per_joint import repeat_for_joints
 from companion.sitl_config.world import World
 
 WORLDS = names("worlds")
-"""Names of the built-in worlds."""
 DEFAULT_WORLD = "ideal"
 """The world of a configuration that names none."""
 RENAMED = {

@@ -26,7 +26,6 @@ from sitl.world.machine import Machine
 LINK_DELAY_S = 0.002
 """Time from sending a setpoint to its arrival at PX4 where the link itself takes no simulated time."""
 STUB_VERSION = "1.16"
-"""PX4 version that the stub imitates."""
 
 
 class Observation(NamedTuple):

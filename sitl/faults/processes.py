@@ -95,7 +95,6 @@ class ProcessFaults:
         self.pid: int | None = None
         """Pid of the flight process, which the launcher sends; None until then."""
         self.kind: FlightFaultKind | None = None
-        """Kind of the fault that was injected, or None."""
         self._t_s = 0.0
         self._start_m: Vec3 = (0.0, 0.0, 0.0)
         self._position_m: Vec3 = (0.0, 0.0, 0.0)

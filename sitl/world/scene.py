@@ -44,7 +44,6 @@ class Scene:
         mujoco.mj_forward(model, self.data)
         self.payload = Payload(self.machines[0], bodies[0], first.vehicle, first.config, self._events)
         self.bar = None if bar is None else Bar(bar, bodies, self.machines, self._events)
-        """The bar that the machines carry; None if there is none."""
         self.t_s = 0.0
 
     def step(self, airborne: bool = True) -> None:

@@ -150,7 +150,6 @@ class Pairs:
     """Flights of two variants in the same laboratories, with the same payload and model error."""
 
     group: Group
-    """The variant that is compared."""
     base_m_this_m: Sequence[tuple[float, float]]
     """RMS of ||e_p|| after the catch in m, first with the variant compared with, then with this one; infinite if the flight failed.
     Pairs with two failures or a missed payload are left out.

@@ -84,7 +84,6 @@ class FrictionFit:
     joint_friction_nm: Estimate | None
     """Mean of all joints; None if the data do not determine it."""
     notes: tuple[str, ...]
-    """Remarks, one line each."""
 
     @property
     def torque_per_amp_nm_a(self) -> Estimate | None:

@@ -186,7 +186,6 @@ class Done:
     plan: SetupPlan
     outcome: str
     text: tuple[str, ...]
-    """Remarks, one line each."""
     right: bool
     """Whether every servo has the required settings."""
 

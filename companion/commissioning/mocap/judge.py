@@ -177,7 +177,6 @@ class Watched:
     """Recording of a stream."""
 
     frames: Sequence[FrameSeen]
-    """Frames in order of arrival."""
     names: Mapping[int, str]
     """Names of the rigid bodies, by id."""
     info: ServerInfo

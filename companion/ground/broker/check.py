@@ -41,7 +41,6 @@ class CheckResult:
     certificate_ends: str | None
     rights: tuple[TopicRights, ...]
     vehicles: tuple[str, ...]
-    """Vehicles with a retained message."""
 
 
 def check(access: BrokerAccess, vehicle: str | None = None) -> CheckResult:

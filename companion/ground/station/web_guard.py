@@ -25,9 +25,7 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""Headers of every response."""
 MESSAGE_MAX_BYTES = 1024
-"""Largest message from a page."""
 MESSAGES_PER_S, MESSAGES_BURST = 10.0, 20
 _HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
 

@@ -21,7 +21,6 @@ _STATUS_HEAD: Final = struct.Struct("<4sBHBB")
 _CRC: Final = struct.Struct("<H")
 _GOAL: Final = struct.Struct("<Bh")
 STATUS_BYTES: Final = _STATUS_HEAD.size + _CRC.size
-"""Bytes of a status packet without its data."""
 
 
 def sync_read(address: int, size: int, ids: Sequence[int]) -> bytes:

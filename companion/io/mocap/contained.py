@@ -32,7 +32,6 @@ class ContainedClient:
         self._clock = clock
         self.extended = client if isinstance(client, ExtendedClient) else ExtendedClient()
         self.where = self.extended.where or f"mocap {settings.type} {settings.server}"
-        """Beginning of a text on this client."""
         self.extended.clock = clock
         self._markers: MarkerFrame | None = None
         self._rejected = 0

@@ -58,7 +58,6 @@ class OptiTrack(ExtendedClient):
             ) from None
         self.sockets: list[socket.socket] = []
         self.protocol = NatNetClient(settings.rigid_body_id, settings.up_axis, settings.transport, ball=settings.ball)
-        """State of the protocol, for tools."""
         self._markers: MarkerFrame | None = None
         self._bar: BarPose | None = None
         self._foreign = 0

@@ -18,7 +18,6 @@ from companion.runtime.token_bucket import TokenBucket
 
 COMPONENT = int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
 TEXT_BYTES = 50
-"""Size of STATUSTEXT.text."""
 TEXT_MAX_BYTES = 4 * TEXT_BYTES
 TEXT_RATE_HZ = 5.0
 TEXT_BURST = 10
@@ -30,7 +29,6 @@ _OUTCOMES = {Outcome.COMPLETED: _NOTICE, Outcome.REFUSED: _WARNING, Outcome.ABOR
 
 FLOAT32_MAX = 3.4e38
 Text = tuple[int, str]
-"""MAV_SEVERITY and the text."""
 
 
 def event_text(event: Event) -> Text:

@@ -36,7 +36,6 @@ class Wakes:
     def __init__(self, layout: RotorLayout, radius_m: float, spread: float) -> None:
         self._radius_m, self._spread = radius_m, spread
         self._across_m = list(dict.fromkeys(y for _, y, _ in layout.positions_body_m))
-        """Positions along y."""
         rows: dict[float, list[tuple[int, int]]] = {}
         for i, (x, y, _) in enumerate(layout.positions_body_m):
             rows.setdefault(x, []).append((i, self._across_m.index(y)))
