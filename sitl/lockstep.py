@@ -137,7 +137,6 @@ class MachineTime:
     """Simulated time as the processes of one machine share it.
 
     Args:
-        page: the shared page.
         channels: the world's ends of the channels to the processes of the flight, by name.
     """
 
@@ -171,7 +170,6 @@ class TimeKeeper:
     """Simulated time, owned by the world.
 
     Args:
-        machines: the processes of each machine.
         speed: simulated seconds in a second of real time at most.
     """
 

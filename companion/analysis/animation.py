@@ -236,7 +236,6 @@ def plotted(
 
     Args:
         span_s: start and end of the time axis.
-        t_s: time of each value.
         rows: name of each plot, and its values.
         scaled: which of the values the scale must hold.
     """

@@ -44,11 +44,7 @@ class StartCancelled(Exception):
 
 
 class Operator:
-    """Collects commands from the launcher's messages, signals to this process, and the ground station.
-
-    Args:
-        channel: channel to the launcher.
-    """
+    """Collects commands from the launcher's messages, signals to this process, and the ground station."""
 
     def __init__(self, channel: socket.socket) -> None:
         self._channel = channel

@@ -39,7 +39,6 @@ async def land_without_core(
     """Command PX4 to land and monitor it, without interfering with a pilot. PX4 disarms by itself (COM_DISARM_LAND).
 
     Args:
-        channel: channel to the launcher.
         guardian: connection that receives heartbeats of this process.
 
     Returns:

@@ -73,7 +73,6 @@ async def fly(
     """Open the devices, fly, and close them.
 
     Args:
-        channel: channel to the launcher.
         guardian_channel: channel to the guardian; None if there is no guardian.
 
     Raises:

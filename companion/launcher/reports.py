@@ -105,11 +105,7 @@ class FlightReports:
         return outcome
 
     def user_lines(self, outcome: Outcome, busy: str | None) -> tuple[str, ...]:
-        """Return why the flight was refused, which process failed and where its log is.
-
-        Args:
-            busy: that the computer was busy; None if it was not.
-        """
+        """Return why the flight was refused, which process failed and where its log is."""
         if outcome is not Outcome.REFUSED:
             return tuple(self.failures)
         reasons = self._refused

@@ -75,7 +75,6 @@ class TeamLauncher:
 
     Args:
         worlds: the world, as each member sees it.
-        launchers: launcher of each member.
     """
 
     def __init__(self, worlds: Sequence[SitlProcess], launchers: Sequence[Launcher]) -> None:

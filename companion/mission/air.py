@@ -104,7 +104,6 @@ class Air:
     """One tick of a phase with a state of its own; `companion.core.phase_tick` implements it.
 
     Args:
-        o: inputs of the tick.
         phases: phases of the mission (`companion.mission.phase.Phase`).
         segment: segment at the plan's time.
         engaged: segment of the phase whose state it is; after a hold, the plan's time may have passed its end.

@@ -79,7 +79,6 @@ def plan_arm(delta_rad: Joints, limits: ArmLimits, duration_s: float = 0.0) -> A
     Args:
         delta_rad: displacement of each joint; not all zero.
         limits: speed limit of each joint; acceleration and jerk limits common to all.
-        duration_s: requested minimum duration.
 
     Raises:
         ValueError: Ruckig rejects the input. Finite angles and positive limits are always accepted.

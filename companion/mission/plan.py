@@ -176,7 +176,6 @@ def landing_from(
         yaw_rad: kept constant.
         arm_rad: joint angles at the start, at rest.
         arm_fold_rad: joint angles at the end.
-        speed_m_s: speed of the descent.
         vehicle: provides the height of the floor and the reach of the arm.
         back_to_m: position to go to before everything else, from a surface that the tool may touch.
     """

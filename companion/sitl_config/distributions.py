@@ -136,7 +136,6 @@ def draw(data: dict[str, Any], ranges: Sequence[Range], seed: int) -> dict[str, 
 
     Args:
         data: plain data of a world. A range at a missing location (a section that is null, a shorter list) is ignored.
-        ranges: ranges to draw.
     """
     return _filled(data, [(one.at, one.sample(seed)) for one in ranges])
 

@@ -56,9 +56,6 @@ class Throw:
 def throws(mission: Mission, vehicle: Vehicle, flight_s: float = 0.45) -> list[Throw]:
     """Return the catch points along the first pass in the +x direction, in flight order.
 
-    Args:
-        flight_s: time from the throw to the arrival.
-
     Raises:
         CampaignError: the mission has no such pass.
     """

@@ -30,7 +30,6 @@ def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScal
 
     Args:
         vehicle: vehicle file with the assumed ids, baud rate and torques.
-        servos: all servos that are connected to the bus.
 
     Returns:
         None unless exactly one servo of the right model answers at each joint's id and baud rate in the vehicle file and its current

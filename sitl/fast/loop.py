@@ -64,7 +64,6 @@ class FastFlight:
         commands: the operator's commands, by the time on the flight clock at which each is given.
         make_law: makes the control law in place of the configured one.
         scene: the scene of which this is machine `number`; None for a scene of its own.
-        number: number of the machine.
     """
 
     def __init__(

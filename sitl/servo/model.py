@@ -51,7 +51,6 @@ class ServoModel:
     Args:
         servo_id: servo id (register 7).
         baud_bps: baud rate (register 8); the servo receives only packets sent at this rate.
-        kind: name of the model.
         firmware: firmware version (register 6); None for that of the model as delivered.
         model: model number (register 0); None for that of the model.
         shaft_angle_rad: shaft angle before the first `update`.

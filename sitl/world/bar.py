@@ -76,7 +76,6 @@ class Bar:
 
     Args:
         bodies: the model, as each machine sees it; the first machine has the left end.
-        machines: the two machines.
         events: where grips and a fall are reported.
     """
 

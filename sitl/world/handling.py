@@ -83,7 +83,6 @@ class Handling:
 
     Args:
         config: configuration of the world; `handling_t_s`, `handling_taps`, `handling_tap_n`, and `seed` for the hand's sway are used.
-        weight_n: weight of the whole vehicle.
     """
 
     def __init__(self, config: WorldConfig, weight_n: float) -> None:

@@ -58,7 +58,6 @@ class Machine:
     Args:
         spec: vehicle file, configuration and start pose, at which the machine is put.
         events: where contacts and a crash are reported.
-        surfaces: the surfaces of the scene, or None.
     """
 
     def __init__(self, spec: MachineSpec, bodies: Bodies, events: Events, surfaces: Surfaces | None) -> None:

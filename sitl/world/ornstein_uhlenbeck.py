@@ -12,7 +12,6 @@ class OrnsteinUhlenbeck:
     """Independent triples of stationary Ornstein-Uhlenbeck processes with unit RMS, sampled exactly.
 
     Args:
-        count: number of triples.
         correlation_time_s: time after which the autocorrelation has fallen to 1/e.
         source: number of the noise sequence.
     """

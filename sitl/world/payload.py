@@ -54,7 +54,6 @@ class Payload:
     """The payload and the net that catches it; call `step` once per physics step.
 
     Args:
-        machine: the machine with the net.
         events: where throws and catches are reported.
     """
 
@@ -249,9 +248,6 @@ class Payload:
     def catch(self, ball: Ball, t_s: float) -> bool:
         """Return whether the ball is caught: with a bag, once it has settled in the bag; without, once it touches the net, to which
         this call attaches it.
-
-        Args:
-            ball: indices of the ball.
         """
         return self._caught_s(ball, t_s) is not None
 

@@ -25,7 +25,6 @@ class FlightClock:
         """Add the time of one message.
 
         Args:
-            t_s: flight clock.
             monotonic_s: local monotonic clock at receipt, s.
         """
         self._newest_s = max(self._newest_s, t_s)

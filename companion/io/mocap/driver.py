@@ -48,7 +48,6 @@ class MocapDriver:
 
     Args:
         on_pose: called with every new pose; an exception is logged once and never stops the reception.
-        connect_timeout_s: timeout for the server's answer.
         body_timeout_s: timeout for the first pose in which the body is tracked.
         make_client: makes the client in place of the installed system; opening then waits for any frame, not for the body.
 

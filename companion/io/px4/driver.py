@@ -56,7 +56,6 @@ class MavsdkAutopilot:
 
     Args:
         forwarding: whether a second connection is needed; see `forward_to`.
-        estimator_rate_hz: requested rate of ESTIMATOR_STATUS.
     """
 
     def __init__(

@@ -74,7 +74,6 @@ class Inbox:
 
         Args:
             stamp_s: arrival on the flight clock.
-            message_id: MAVLink message id.
             frame: whole frame with a valid checksum.
         """
         taker, listeners = self._takers.get(message_id), self._listeners.get(message_id)

@@ -53,7 +53,6 @@ async def run_hand_test(
     Args:
         devices: open devices; poses need not be forwarded to PX4. An open arm is read during the test to keep its watchdogs from
             tripping.
-        console: terminal of the operator.
         json: whether standard output must stay free; all text for the operator then goes to standard error.
         record: file in which a passed test is recorded (`hand_record.record_path()`); None to record nothing, as in SITL.
     """

@@ -43,10 +43,6 @@ class Air:
         self._loads.set(self._base, "air", *load)
 
     def strength(self, thrust_n: float, height_m: float) -> float:
-        """Return the gusts' strength relative to hover far from the floor.
-
-        Args:
-            thrust_n: thrust of all rotors.
-        """
+        """Return the gusts' strength relative to hover far from the floor."""
         near = max(0.0, 1.0 - height_m / self._config.floor_range_m)
         return thrust_n / self._weight_n * (1.0 + self._config.floor_increase * near)

@@ -113,7 +113,6 @@ class Rotors:
         axis.
 
         Args:
-            thrust_n: thrust of all rotors.
             airspeed_m_s: velocity of the air relative to the vehicle, world frame.
             q: position and attitude of the base, as MuJoCo's qpos.
         """
