@@ -262,7 +262,7 @@ class Launcher:
                 for said in sitl.messages(0.0):
                     self._on_message(said)
                 if sitl.ended:  # nothing is left to land
-                    guardian.kill()
+                    guardian.process.kill()
                     process.kill()
                     return
             for message in guardian.receive():
@@ -288,7 +288,7 @@ class Launcher:
             alone_s = now_s - flight_open_s
             if guardian.hangs() or (not guardian.took_over and alone_s > GUARDIAN_EXIT_TIMEOUT_S):
                 self._reports.failures.append("guardian: the guardian process hung and was killed")
-                guardian.kill()
+                guardian.process.kill()
                 return
 
     def _now_s(self) -> float:

@@ -25,11 +25,11 @@ from companion.ground.protocol.messages import (
     Presence,
     State,
     Topic,
-    encode,
 )
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import StreamBuilder, truncated
+from companion.model.codec import to_json
 from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Tick, read_packet
 from companion.model.types import Outcome, SafetyAction
 
@@ -136,7 +136,7 @@ class TelemetrySession:
     def last_will(self) -> bytes:
         """Return the state that the broker publishes if this process disappears."""
         text = "the connection to the vehicle was lost"
-        return encode(replace(self._state, presence=Presence.LOST, wall_s=0.0, commands=False, text=text))
+        return to_json(replace(self._state, presence=Presence.LOST, wall_s=0.0, commands=False, text=text))
 
     def take_packet(self, received_s: float, data: bytes) -> None:
         """Process one packet of the flight's or the guardian's channel. Never raises: the log has the packet in any case."""
@@ -224,20 +224,20 @@ class TelemetrySession:
         if now_s - self._state_sent_s >= STATE_PERIOD_S:
             self._state_sent_s = now_s
             self._state = replace(self._state, wall_s=round(wall_s, 3))
-            out.retained[Topic.STATE] = encode(self._state)
+            out.retained[Topic.STATE] = to_json(self._state)
         for topic, record in ((Topic.SCENE, self._scene), (Topic.PREFLIGHT, self._preflight)):
             if topic in self._changed:
-                out.retained[topic] = encode(record)
+                out.retained[topic] = to_json(record)
         self._changed.clear()
         if self._events_sent != self._stream.count:
             self._events_sent = self._stream.count
-            out.retained[Topic.EVENTS] = encode(self._stream.events_message())
+            out.retained[Topic.EVENTS] = to_json(self._stream.events_message())
         if self._new_ticks:
             self._new_ticks = False
             stream = self._stream.build(wall_s, dropped=dropped, recorder_error=recorder_error)
             keys = self._verifier.operators.keys if self._verifier is not None else ()
-            out.stream = encode(with_proofs(stream, self.vehicle, keys))
-        out.acks = [encode(self._proven(ack)) for ack in self._acks]
+            out.stream = to_json(with_proofs(stream, self.vehicle, keys))
+        out.acks = [to_json(self._proven(ack)) for ack in self._acks]
         self._acks.clear()
         out.log = list(self._log)
         self._log.clear()

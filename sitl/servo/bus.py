@@ -39,18 +39,9 @@ class ServoLine:
 
     def __init__(self, servos: Iterable[ServoModel]) -> None:
         self.servos = tuple(servos)
-        self._parser = PacketParser()
+        self.parser = PacketParser()
         self._listening: list[ServoModel] = []
         self._delay_s = 0.0
-
-    @property
-    def packet_pending(self) -> bool:
-        """Whether a packet has begun and is incomplete."""
-        return self._parser.pending
-
-    def drop_partial(self) -> None:
-        """Drop an incomplete packet; call this method if the line goes idle in the middle of a packet."""
-        self._parser.drop_partial()
 
     def feed(self, data: bytes, baud_bps: int | None = None) -> bytes:
         """Process bytes from the master and return the servos' answer; never raise an exception.
@@ -63,7 +54,7 @@ class ServoLine:
     def exchange(self, data: bytes, baud_bps: int | None = None) -> tuple[bytes, float]:
         """Process bytes like `feed`, and also return the sum of the servos' return delay times in s."""
         self._delay_s = 0.0
-        packets = self._parser.feed(data)
+        packets = self.parser.feed(data)
         if not packets:
             return b"", 0.0
         self._listening = [s for s in self.servos if not s.silent and baud_bps in (None, s.baud_bps)]
@@ -77,7 +68,7 @@ class ServoLine:
         if packet.instruction == Instruction.STATUS:
             return b""
         for servo in self._listening:
-            servo.heard_instruction()
+            servo.drive.heard_instruction()
         handler = {
             Instruction.SYNC_READ: self._sync_read,
             Instruction.SYNC_WRITE: self._sync_write,
@@ -284,8 +275,8 @@ class ServoBus:
     def _on_bytes(self, data: bytes) -> None:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
-        if self._page is None and self.line.packet_pending and now_s - self._last_byte_s > _PARTIAL_TIMEOUT_S:
-            self.line.drop_partial()
+        if self._page is None and self.line.parser.pending and now_s - self._last_byte_s > _PARTIAL_TIMEOUT_S:
+            self.line.parser.drop_partial()
         self._last_byte_s = now_s
         # No servo supports a speed without a name in termios.
         baud_bps = _BAUD_OF_SPEED.get(self._pty.speed(), 0)

@@ -195,10 +195,6 @@ class ServoModel:
         """Alert bit (0x80) of every status packet's error byte if register 70 reports an error, else 0."""
         return ALERT if self._memory[70] else 0
 
-    def heard_instruction(self) -> None:
-        """Restart the watchdog's timer, because a valid instruction packet for any servo was on the bus."""
-        self.drive.heard_instruction()
-
     def read(self, address: int, length: int) -> bytes:
         """Return bytes of the control table.
 

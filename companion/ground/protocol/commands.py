@@ -120,7 +120,7 @@ def sign(command: Command, key: bytes) -> Command:
 def make_command(
     name: OperatorCommand, vehicle: str, session: str, operator: str, key: bytes, t_ms: int, hold: int = 0
 ) -> Command:
-    """Return a signed command with a new nonce; `companion.ground.protocol.messages.encode` makes the payload.
+    """Return a signed command with a new nonce; `companion.model.codec.to_json` makes the payload.
 
     Args:
         session: `State.session` or `Stream.session` of the flight.
