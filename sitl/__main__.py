@@ -75,7 +75,6 @@ class _Member:
     """Descriptors from which it reads what the launcher says, and to which it writes."""
     time: MachineTime | None
     px4_folder: Path | None
-    """Folder of its real PX4; None for the stub."""
 
     def send(self, message: WorldMessage) -> None:
         """Send a message to the launcher."""
@@ -136,9 +135,7 @@ def _send_final(sitl: Sitl, members: Sequence[_Member]) -> None:
 
 
 def _end_with_launchers(sitl: Sitl, descriptors: Sequence[int]) -> None:
-    """Read the pid of each machine's flight process from its launcher. When all launchers have ended, end the world once the vehicles
-    have landed.
-    """
+    """Read each flight process's pid from its launcher; once all launchers have ended, end the world when all have landed."""
     loop = asyncio.get_running_loop()
     open_ends = set(descriptors)
 

@@ -27,10 +27,6 @@ def settings_of(
     Args:
         device: section `devices` of the vehicle file; a device of another type is replaced.
         mocap: the NatNet server, or None if another program feeds PX4 with poses.
-        mocap_rate_hz: rate of its frames.
-        multicast: whether it sends by multicast.
-        arm: the servo bus, or None without an arm.
-        force: the force sensor, or None.
     """
     found: Settings = {}
     if mocap is not None:

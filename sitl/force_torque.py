@@ -79,7 +79,8 @@ class ForceTorqueServer:
         self._bias_force_n: Vec3 = _ZERO
         self._bias_torque_nm: Vec3 = _ZERO
         self._rate_code = 0
-        self._streaming = False
+        self.streaming = False
+        """Whether continuous output is on."""
         self._due_s: float | None = None
         self._reading = Wrench(force_n=_ZERO, torque_nm=_ZERO, overload_bits=0)
 
@@ -92,11 +93,6 @@ class ForceTorqueServer:
     def rate_hz(self) -> int:
         """Present output rate in Hz."""
         return rft.RATE_CODES[self._rate_code]
-
-    @property
-    def streaming(self) -> bool:
-        """Whether continuous output is on."""
-        return self._streaming
 
     async def __aenter__(self) -> Self:
         self._pty.open()
@@ -120,11 +116,11 @@ class ForceTorqueServer:
 
     def due(self, t_s: float) -> bool:
         """Return whether a packet is due by world time `t_s`."""
-        return self._streaming and (self._due_s is None or t_s >= self._due_s - TIME_EPSILON_S)
+        return self.streaming and (self._due_s is None or t_s >= self._due_s - TIME_EPSILON_S)
 
     def tick(self, t_s: float) -> None:
         """Send every packet that is due by world time `t_s`; call this method every 1 to 2 ms of world time."""
-        if not self._streaming:
+        if not self.streaming:
             return
         period_s = 1.0 / self.rate_hz
         if self._due_s is None or t_s - self._due_s > _MAX_CATCH_UP * period_s:
@@ -166,16 +162,16 @@ class ForceTorqueServer:
 
     def _execute(self, command: Command, parameter: int) -> None:
         if command == Command.STOP:
-            self._streaming = False
+            self.streaming = False
             return
         if command == Command.SET_BIAS:
             self._bias_force_n = self._force_n if parameter else _ZERO
             self._bias_torque_nm = self._torque_nm if parameter else _ZERO
             return
-        if self._streaming:
+        if self.streaming:
             return
         if command == Command.START:
-            self._streaming = True
+            self.streaming = True
             self._due_s = None
         elif command == Command.READ_ONCE:
             self._send_reading(Command.READ_ONCE)

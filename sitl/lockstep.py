@@ -98,7 +98,6 @@ class Process:
         """Return whether it wants to work at this instant.
 
         Args:
-            now_s: simulated time.
             data: whether a frame of motion capture was sent.
         """
         report = self._report
@@ -138,7 +137,6 @@ class MachineTime:
     """Simulated time as the processes of one machine share it.
 
     Args:
-        page: the shared page.
         channels: the world's ends of the channels to the processes of the flight, by name.
     """
 
@@ -172,7 +170,6 @@ class TimeKeeper:
     """Simulated time, owned by the world.
 
     Args:
-        machines: the processes of each machine.
         speed: simulated seconds in a second of real time at most.
     """
 
@@ -225,7 +222,6 @@ class TimeKeeper:
         """Advance simulated time, let every process that wants to work do so, and keep the pace.
 
         Args:
-            now_s: simulated time.
             data: whether a frame of motion capture was sent.
         """
         self._write(now_s)

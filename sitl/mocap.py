@@ -42,10 +42,7 @@ class Mocap:
     """Motion capture of one machine.
 
     Args:
-        config: configuration of the world.
         ball: how the thrown ball is seen; None if no marker is streamed.
-        scene: the scene of the machine.
-        machine: the machine whose body is tracked.
         between_steps: whether exposures are at the exact time between physics steps instead of at the end of a step.
     """
 
@@ -60,7 +57,6 @@ class Mocap:
         self._noise_rad = math.radians(config.mocap_noise_deg)
         self._seed_noise()
         self.faults: Faults | None = None
-        """Faults of this world; None if there are none."""
         self._queue: deque[tuple[float, MocapFrame]] = deque()
         """Frames on their way, each with the world time at which it arrives."""
         self._next_s = 0.0

@@ -100,7 +100,8 @@ class NatNetServer:
         self._broadcast: socket.socket | None = None
         self._clients: dict[tuple[str, int], float] = {}
         """Time at which each unicast client was last heard, by its address."""
-        self._number = 0
+        self.frame_number = 0
+        """Number of the newest frame; 0 before the first."""
 
     @property
     def command_port(self) -> int:
@@ -111,11 +112,6 @@ class NatNetServer:
     def data_port(self) -> int:
         """Port that multicast frames go to."""
         return _port(self._data, self._ports[1])
-
-    @property
-    def frame_number(self) -> int:
-        """Number of the newest frame; 0 before the first."""
-        return self._number
 
     @property
     def unicast_clients(self) -> tuple[tuple[str, int], ...]:
@@ -154,7 +150,7 @@ class NatNetServer:
 
     def start_over(self) -> None:
         """Go on at a frame number that does not depend on the past: world time starts over."""
-        self._number += _NUMBERS - self._number % _NUMBERS
+        self.frame_number += _NUMBERS - self.frame_number % _NUMBERS
         self._clients = dict.fromkeys(self._clients, self._clock())
 
     def publish(
@@ -168,18 +164,17 @@ class NatNetServer:
 
         Args:
             t_s: time of transmission on the world's clock.
-            poses: rigid bodies of this frame.
             exposure_t_s: middle of the cameras' exposure on the same clock, or None if the cameras do not report it.
             markers: markers that belong to no rigid body, in the axes of the stream.
         """
-        self._number += 1
+        self.frame_number += 1
         oldest_s = self._clock() - _CLIENT_TIMEOUT_S
         self._clients = {address: heard_s for address, heard_s in self._clients.items() if heard_s >= oldest_s}
         addresses = list(self._clients)
         if self.multicast_group is not None:
             addresses.insert(0, (self.multicast_group, self.data_port))
         if addresses:
-            frame = encode_frame(self.version, self._number, t_s, poses, exposure_t_s, dict(self.bodies), markers)
+            frame = encode_frame(self.version, self.frame_number, t_s, poses, exposure_t_s, dict(self.bodies), markers)
             for address in addresses:
                 self._send(self._data, frame, address)
 
@@ -265,7 +260,6 @@ def encode_frame(
 
     Args:
         version: NatNet bitstream version.
-        number: frame number.
         t_s: as for `NatNetServer.publish`.
         poses: as for `NatNetServer.publish`.
         exposure_t_s: as for `NatNetServer.publish`.
@@ -355,7 +349,6 @@ def encode_model_definitions(version: str, bodies: Sequence[tuple[int, str]]) ->
 
 
 def _numbers(version: str) -> tuple[int, int]:
-    """Return the major and minor number of a version."""
     major, _, minor = version.partition(".")
     return int(major), int(minor)
 

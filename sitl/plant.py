@@ -72,7 +72,6 @@ class _JointServo(NamedTuple):
 
 
 def _zero_rad(joint: Joint, servo: Servo) -> float:
-    """Return the shaft angle at joint angle 0."""
     return joint.zero_count / _COUNTS_PER_RAD + joint.sign * math.radians(servo.zero_error_deg)
 
 
@@ -89,11 +88,6 @@ class Plant:
     """The simulated world with its sensors and motors.
 
     Args:
-        vehicle: vehicle file.
-        config: configuration of the world.
-        px4: the autopilot.
-        drives: motor of each joint.
-        start: pose of the vehicle at the start.
         between_steps: as in `Mocap`.
         jaws: motor of the clamp's servo; None without a clamp.
         scene: the scene of which this is machine `number`; None for a scene of its own.
@@ -167,7 +161,6 @@ class Plant:
         self._imu_sample: ImuSample | None = None
         self.armed_t_s: float | None = None
         self.faults: Faults | None = None
-        """Faults of this world; None if there are none."""
 
     def _seed_noise(self) -> None:
         """Start one noise sequence per sensor. The sequences restart at arming, so that the noise in flight depends only on the seed,
@@ -281,9 +274,7 @@ class Plant:
         return ImuSample(self.scene.t_s, (p, -q, -r), (ax, -ay, -az))
 
     def battery(self) -> Battery:
-        """Return the measurement of the power module. If the battery effect is off, the charge falls linearly with the time since
-        arming.
-        """
+        """Return the power module's measurement; without the battery effect, the charge falls linearly since arming."""
         pack, sag_v = self.machine.battery, 0.0 if self.faults is None else self.faults.sag_v
         if pack is not None:
             return Battery(pack.voltage_v - sag_v, pack.current_a, pack.remaining, pack.drawn_as / 3.6)

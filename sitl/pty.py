@@ -82,7 +82,6 @@ class PtyLine:
         return len(data) - written
 
     def _waiting(self) -> int:
-        """Return the number of bytes that the companion can read."""
         return int(_INT.unpack(fcntl.ioctl(self._companion_fd, termios.FIONREAD, _INT.pack(0)))[0])
 
     def await_arrival(self) -> None:

@@ -35,9 +35,7 @@ class TrueCourse:
         """Record the state of the vehicle before a step, if it is due.
 
         Args:
-            plant: the vehicle.
             faults: faults of the world; sampling begins with the first.
-            tether: tether of the vehicle file.
             frame: number of the newest motion-capture frame; 0 without one.
         """
         t_s, frames = plant.t_s, self._frames
@@ -65,7 +63,6 @@ class BarCourse:
         """Record the bar after a step, if it is due.
 
         Args:
-            scene: a scene with a bar.
             frame: number of the newest motion-capture frame.
         """
         bar = scene.bar

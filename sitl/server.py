@@ -37,7 +37,6 @@ class Sitl:
     The first machine's configuration is that of motion capture: its rate, its delays and its faults are those of the server.
 
     Args:
-        machines: the machines.
         keeper: simulated time, for a world in lockstep; None for a world in real time.
         make_scene: makes the scene of several machines; None for the scene that the only machine makes.
     """
@@ -93,9 +92,7 @@ class Sitl:
         return any(machine.autopilot.armed for machine in self.machines)
 
     def _start_over(self) -> None:
-        """Put the world back to its beginning, as the flight begins: what happens in the flight does not depend on how long the
-        preflight took. What the companion has set in the devices stays.
-        """
+        """Put the world back to its beginning, whatever the preflight took; the companion's settings in the devices stay."""
         assert self._keeper is not None
         if self._armed or not all(machine.autopilot.start_over() for machine in self.machines):
             return

@@ -15,7 +15,6 @@ def check_catch(law: str, preset: str | None = None, mission: str | Path = DEFAU
     """Fly a catch in the fast loop, in the ideal world, with an installed control law.
 
     Args:
-        law: name of the law.
         preset: one of its presets; None for the default.
         mission: mission file with a catch, or the name of a shipped one.
 
@@ -33,7 +32,6 @@ def check_flight(mission: str | Path, *overrides: str) -> list[Event]:
 
     Args:
         mission: mission file, or the name of a shipped one.
-        overrides: `--set` options.
 
     Raises:
         AssertionError: the mission cannot be flown, or was not completed.

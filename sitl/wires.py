@@ -49,10 +49,6 @@ class MachineWires:
     """A simulated machine and the links to its devices; `Sitl` steps it, and its motion capture sees it.
 
     Args:
-        vehicle: vehicle file.
-        config: configuration of the world.
-        start: pose of the vehicle at the start.
-        ports: UDP ports.
         on_message: called with every event, as a message for the launcher.
         autopilot: a real PX4, or None for the stub.
         time: simulated time of the machine's processes; None for a world in real time.

@@ -113,9 +113,7 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
 
 
 def _end(log: FlightLog, flying: npt.NDArray[np.intp], scene: Scene) -> int:
-    """Return the index in the log at which the animation ends: where the landing's reference reaches the floor, or else the end
-    of the flight.
-    """
+    """Return the index in the log at which the animation ends: where the landing's reference reaches the floor, or the flight's end."""
     landing = np.array([log.outputs[k].phase_kind is PhaseKind.LANDING for k in flying])
     low = log.columns.reference_position_world_m[flying, 2] < scene.standing_height_m
     return int(flying[np.argmax(landing & low)] if (landing & low).any() else flying[-1])
@@ -186,9 +184,7 @@ class Track:
 
 
 def _filled(values: Array) -> Array:
-    """Return, for each row, the index of the newest finite row up to it. Rows before the first finite one get the index of that
-    one.
-    """
+    """Return, for each row, the index of the newest finite row up to it; before the first finite row, the index of that one."""
     known = np.isfinite(values).all(axis=1)
     index = np.where(known, np.arange(len(values)), -1)
     filled = np.maximum.accumulate(index)
@@ -240,7 +236,6 @@ def plotted(
 
     Args:
         span_s: start and end of the time axis.
-        t_s: time of each value.
         rows: name of each plot, and its values.
         scaled: which of the values the scale must hold.
     """

@@ -99,9 +99,7 @@ def rotor_distance_m(summary: dict[str, Any]) -> float | None:
 
 
 def surface_error(summary: dict[str, Any]) -> tuple[float, float] | None:
-    """Return by how much the found surface is beside the nearest true one, m, and the angle between the normals, deg; None if no
-    surface was found by points, or if the true ones are unknown.
-    """
+    """Return the found surface's distance from the nearest true one, m, and the angle of the normals, deg; None if unknown."""
     surface = (summary.get("contact") or {}).get("surface")
     true = ((summary.get("world") or {}).get("contact") or {}).get("surfaces")
     if not surface or not surface["points"] or not true:

@@ -35,7 +35,6 @@ def write_tables(log: FlightLog, out: Path, suffix: str) -> list[Path]:
     """Write the tables of `FlightLog.to_pandas` and `ABOUT`; return the paths.
 
     Args:
-        log: the flight.
         out: folder, which is made.
         suffix: `csv` or `parquet`.
 

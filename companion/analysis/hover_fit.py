@@ -99,9 +99,7 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
 
 
 def _calm(log: FlightLog) -> Array:
-    """Return the ticks of steady flight, shape (N, 4): duration in s, normalised thrust, load as a fraction of the weight, and
-    battery voltage in V (NaN if unknown).
-    """
+    """Return the ticks of steady flight, (N, 4): duration s, normalised thrust, load over weight, battery voltage V or NaN."""
     vehicle = log.config.get("vehicle") or {}
     mass_kg = (vehicle.get("airframe") or {}).get("mass_kg")
     force_timeout_s = (vehicle.get("safety") or {}).get("force_timeout_s", 0.25)

@@ -255,9 +255,7 @@ def _cells(record: Any) -> dict[str, Any]:
 
 
 class _Rows:
-    """Assembles the three records of each tick, and thins the ticks when there are too many. Chunks hold whole ticks; a file with
-    incomplete ticks was not written by the recorder.
-    """
+    """Assembles the three records of each tick, which a chunk holds whole, and thins the ticks when there are too many."""
 
     def __init__(self, ticks_max: int | None) -> None:
         self._ticks_max = ticks_max

@@ -77,9 +77,7 @@ def _confirmed_catch_index(log: FlightLog) -> int | None:
 
 
 def flight_masks(log: FlightLog) -> tuple[Mask, Mask]:
-    """Return two masks of the ticks of kind FLIGHT: those before the catch, and those from the catch on. Without a catch the
-    second selects none.
-    """
+    """Return two masks of the ticks of kind FLIGHT: before the catch, and from the catch on, which is empty without a catch."""
     flight = np.array([o.phase_kind is PhaseKind.FLIGHT for o in log.outputs], dtype=np.bool_)
     caught = catch_index(log)
     after = np.arange(len(flight)) >= (len(flight) if caught is None else caught)
@@ -209,9 +207,7 @@ def _passing(values: list[float], k: float) -> list[float]:
 
 
 def lowpass_zero_phase(rows: Array, period_s: float, cutoff_hz: float) -> Array:
-    """Apply a second-order Butterworth low-pass filter forwards and backwards along axis 0 of `rows`, (ticks, columns), with odd
-    reflection at the ends; its gain is 1/2 at the cutoff.
-    """
+    """Filter `rows`, (ticks, columns), by a Butterworth low-pass of order 2 forwards and backwards; gain 1/2 at the cutoff."""
     k = math.tan(math.pi * min(cutoff_hz * period_s, 0.49))
     norm = 1.0 / (1.0 + math.sqrt(2.0) * k + k * k)
     b0 = k * k * norm
@@ -257,9 +253,7 @@ def percentiles(durations_s: Array) -> dict[str, float | None]:
 
 
 def slack_m(log: FlightLog) -> Array:
-    """Return the tether length minus the distance from anchor to attachment point, measured by motion capture, for each tick; NaN
-    on the ground and where unknown.
-    """
+    """Return each tick's tether length minus mocap's distance from anchor to attachment; NaN on the ground and where unknown."""
     slack = np.full(len(log.inputs), np.nan)
     tether = (log.config.get("vehicle") or {}).get("tether")
     if not isinstance(tether, dict) or not {"anchor_world_m", "length_m"} <= tether.keys():

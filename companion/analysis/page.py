@@ -52,7 +52,6 @@ class Page:
     verdict: str = ""
     """One sentence at the top."""
     good: bool = True
-    """Whether the verdict is good."""
     notes: Sequence[str] = ()
     """Notes to read before the values."""
     badge: str = ""

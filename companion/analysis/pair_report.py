@@ -49,10 +49,6 @@ def write_pair_report(
     """Write report.html and its plot into the folder of the team's flight, and return the path of report.html.
 
     Args:
-        summary: content of the team's summary.json.
-        truth: what the world recorded of the bar.
-        left: log of the vehicle at the left end.
-        right: log of the other vehicle.
         out: folder of the flight; the report of each vehicle is in a folder of its own there.
     """
     sides = Course(left, truth), Course(right, truth)

@@ -113,7 +113,6 @@ def scale_path(panes: Sequence[tuple[Any, int]], *positions_m: Any) -> None:
     A pane shows 0.6 m or more, so that noise of millimetres does not look large.
 
     Args:
-        panes: of `path_panes`.
         positions_m: arrays of shape (N, 3).
     """
     every_m = np.concatenate(positions_m)

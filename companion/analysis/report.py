@@ -135,7 +135,6 @@ def _results(summary: dict[str, Any], stride: int, catches: bool) -> list[Table]
 
 
 def _contact(summary: dict[str, Any]) -> list[Table]:
-    """Return the table of a contact; nothing for a flight without contact."""
     contact = summary.get("contact")
     if contact is None:
         return []

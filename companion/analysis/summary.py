@@ -134,9 +134,7 @@ def _chase(log: FlightLog) -> dict[str, Any] | None:
 
 
 def effective_config(log: FlightLog, summary: dict[str, Any]) -> dict[str, Any]:
-    """Return the logged configuration, plus that of the simulated world if the summary has one; empty if the log has no
-    configuration.
-    """
+    """Return the logged configuration, plus the simulated world's if the summary has one; empty without a configuration."""
     world = summary.get("world")
     if not log.config or not world:
         return log.config

@@ -86,7 +86,6 @@ def table(
     Args:
         kind: returns the kind of an item's row, a key of `STYLES` or empty.
         group: returns the group of an item; a rule separates neighbouring groups.
-        folded: see `Table.folded`.
     """
     rows = []
     for number, (_, members) in enumerate(groupby(items, group)):

@@ -21,9 +21,7 @@ _PHASES = {PhaseKind.TAKEOFF: "#eaf3fb", PhaseKind.FLIGHT: "#ffffff", PhaseKind.
 def stack(
     log: FlightLog, title: str, heights: tuple[float, ...], height_in: float = 6.8
 ) -> tuple[Figure, list[Any], Array]:
-    """Return a figure, its axes stacked over a common time axis on which the phases and the catch are marked, and the mission
-    time of each tick, s (NaN outside the marked phases).
-    """
+    """Return a figure, its axes over a common time axis with phases and catch marked, and each tick's mission time or NaN."""
     figure = new_figure(height_in, layout=None)  # a layout by measuring takes half of the time of drawing
     figure.subplots_adjust(left=0.09, right=0.985, top=1.0 - 0.62 / height_in, bottom=0.5 / height_in, hspace=0.13)
     grid = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)

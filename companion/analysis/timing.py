@@ -30,9 +30,7 @@ class Timing:
     lateness_s: Array
     """Delay of the tick's start after its deadline."""
     joint_read_to_write_s: Array
-    """Time from the last servo's answer until the currents are written, both measured in the bus thread, for ticks that wrote
-    currents.
-    """
+    """Time from the last servo's answer until the currents are written, by the bus thread's clock, for ticks that wrote currents."""
     mocap_to_setpoint_s: Array
     """Time from the arrival of the mocap datagram until the setpoint is sent, for ticks with a new frame that sent a setpoint."""
     wait_for_joints_s: Array
@@ -44,13 +42,9 @@ class Timing:
     whole_s: Array
     """Time from the tick's start until the setpoint is sent and the bus thread has the currents."""
     bus_read_s: Array
-    """Time from the start of the joint read to the last servo's answer, both measured in the bus thread, for ticks with a new
-    joint state.
-    """
+    """Time from the start of the joint read to the last servo's answer, by the bus thread's clock, for ticks with a new joint state."""
     bus_cycle_s: Array
-    """Time from the start of the joint read until the resulting currents are written, both measured in the bus thread, for the
-    same ticks as `joint_read_to_write_s`.
-    """
+    """Time from the start of the joint read until the currents are written, for the same ticks as `joint_read_to_write_s`."""
 
 
 _KEPT = tuple(field.name for field in fields(Timing) if field.type == "Array")

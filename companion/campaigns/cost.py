@@ -23,7 +23,6 @@ class Term:
     """Dotted key of a row (see `companion.campaigns.compare.aggregate`)."""
     weight: float
     unit: str
-    """Unit of the weight."""
     text: str
 
 

@@ -27,7 +27,6 @@ class Plan:
     """Measured cost of a sample of flights, and the duration of the whole campaign computed from it."""
 
     flights: int
-    """Number of flights of the campaign."""
     sample: int
     """Number of flights flown."""
     at_once: int

@@ -61,7 +61,6 @@ class Campaign(ABC):
     flights: Sequence[Message]
     """Each flight in the format of `sitl.campaigns`."""
     command: str
-    """The command line, for the record."""
     overrides: Sequence[str] = ()
     jobs: int | None = None
     """Number of processes; None for one per core."""
@@ -139,9 +138,7 @@ class CampaignResult:
     """Results of a whole campaign."""
 
     messages: list[Message]
-    """Results of the flights in the order of the campaign."""
     notes: list[str] = field(default_factory=list)
-    """Reasons for missing results."""
     code: int = EXIT_OK
 
     @property

@@ -29,7 +29,6 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
 
     Args:
         one_law: whether the campaign flies a single control law; adds `--controller` and `--preset`.
-        world: default of `--world`.
     """
     parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
     if one_law:
@@ -126,10 +125,6 @@ def fly(campaign: Campaign, arguments: argparse.Namespace, parent: str) -> int:
 @contextlib.contextmanager
 def results_folder(arguments: argparse.Namespace, parent: str, result: str | None) -> Iterator[Path]:
     """Yield the folder for the results: `--out`, or a new one under `parent`. Afterwards it is removed if nothing was written.
-
-    Args:
-        parent: folder of the new folder.
-        result: as in `why_unusable`.
 
     Raises:
         ConfigError: the folder cannot be used.

@@ -69,8 +69,6 @@ def run(arguments: argparse.Namespace, config: SitlConfig, world: SitlProcess | 
     """Run the command and return the exit code.
 
     Args:
-        arguments: options of the command.
-        config: checked configuration.
         world: with `--sitl`, a world that runs already; None to start one.
     """
     found = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
@@ -131,11 +129,7 @@ def _rows(
     people: Console,
     world: SitlProcess | None,
 ) -> list[Row]:
-    """Return the rows of all checks.
-
-    Raises:
-        LaunchError: the simulated world could not be started.
-    """
+    """Return the rows of all checks; raises LaunchError if the simulated world cannot be started."""
     config = sitl_config.flight
     with contextlib.ExitStack() as stack:
         line = stack.enter_context(_Line(people))

@@ -101,11 +101,7 @@ class _Commander:
             self._end(EXIT_REFUSED, f"{vehicle}: {ack_text(ack)}")
 
     async def _found(self, station: Station) -> str | None:
-        """Return the vehicle to command; None if there are several, after reporting this.
-
-        Retained messages arrive before the link reports that it is connected (`Station`, in_order): before that, no vehicle is
-        reported as missing.
-        """
+        """Return the vehicle to command, None after reporting several; retained messages arrive before the link is connected."""
         connected_s: float | None = None
         while True:
             self.changed.clear()

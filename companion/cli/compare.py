@@ -94,11 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _campaign(arguments: argparse.Namespace) -> Compare:
-    """Return the campaign, after checking every configuration.
-
-    Raises:
-        ConfigError: one line per problem.
-    """
+    """Return the campaign, after checking every configuration; raises ConfigError, one line per problem."""
     for override in arguments.overrides:
         for key, option in _OPTIONS.items():
             if override.partition("=")[0].strip() == key:

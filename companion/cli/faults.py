@@ -77,11 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _campaign(arguments: argparse.Namespace) -> Faults:
-    """Return the campaign, after checking its configuration and its flights.
-
-    Raises:
-        ConfigError: one line per problem; also if there is no fault to fly.
-    """
+    """Return the campaign, after checking its configuration and its flights; raises ConfigError, one line per problem."""
     touching = [kind for kind in arguments.kinds if KINDS[kind].phases == CONTACT_PHASES]
     if touching and not arguments.phases:
         if len(touching) < len(arguments.kinds):

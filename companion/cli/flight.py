@@ -124,7 +124,7 @@ def _load(arguments: argparse.Namespace, *, hardware: bool, real_px4: bool = Fal
     if getattr(arguments, "member", None) is not None:
         if not hardware:
             text = "expected only on the vehicle; in the simulated world both fly: companion team fly FILE --sitl"
-            raise ConfigError([f"companion {arguments.command}: --member {arguments.member}: {text}"])
+            raise ConfigError(f"companion {arguments.command}: --member {arguments.member}: {text}")
         law, preset = arguments.controller, arguments.preset
         team = load_team(
             arguments.mission,

@@ -159,11 +159,7 @@ def _undo(arguments: argparse.Namespace, root: Path) -> int:
 
 
 def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tuple[str, ...]]:
-    """Return the checked settings, and lines that explain their origin.
-
-    Raises:
-        ConfigError: the command line or a file is wrong.
-    """
+    """Return the checked settings, and lines that explain their origin; raises ConfigError."""
 
     live = root == Path("/")
     if _NAME.fullmatch(arguments.user) is None or arguments.user == "root":
@@ -204,11 +200,7 @@ def _settings(arguments: argparse.Namespace, root: Path) -> tuple[Settings, tupl
 
 
 def _seen_by_the_service(option: str, file: str, root: Path) -> str:
-    """Return the absolute path of a file on the vehicle's computer.
-
-    Raises:
-        ConfigError: the service could not read the file there.
-    """
+    """Return the absolute path of a file on the vehicle's computer; raises ConfigError if the service could not read it there."""
     path = os.path.abspath(file)
     if any(ord(c) < 32 for c in path):
         raise ConfigError(f"{option} {file!r:.80}: expected a path without control characters")

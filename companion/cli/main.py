@@ -82,9 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _normalised(argv: list[str]) -> list[str]:
-    """Convert `--sitl` and `--foxglove` without a value to `--sitl=stub` and the default address, and `--set a=1 b=2` to one `--set`
-    each.
-    """
+    """Convert `--sitl` and `--foxglove` without a value to their default values, and `--set a=1 b=2` to one `--set` each."""
     out: list[str] = []
     in_set = False
     for word, following in zip(argv, [*argv[1:], ""], strict=False):
@@ -109,9 +107,7 @@ def _normalised(argv: list[str]) -> list[str]:
 
 
 def make_parser(first: Sequence[str] = ()) -> argparse.ArgumentParser:
-    """Return the parser of the command that comes first on the command line, or else of all commands, which takes half a second to
-    load.
-    """
+    """Return the parser of the first command on the command line, or else of all commands, which takes half a second to load."""
     parser = _Parser(
         prog="companion", description="Flies an aerial manipulator on PX4 with adaptive impedance control."
     )

@@ -112,11 +112,7 @@ async def until_signal(work: Coroutine[Any, Any, Any]) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    """Check that the options are compatible.
-
-    Raises:
-        ConfigError: an option is out of range, or two options exclude each other; one line.
-    """
+    """Check that the options are in range and compatible; raises ConfigError, one line."""
     if arguments.text and arguments.logs:
         raise ConfigError(
             "companion monitor: --text shows only live flights; to view logs, leave out --text or use companion report"

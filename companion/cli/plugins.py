@@ -40,11 +40,7 @@ def run(_: argparse.Namespace) -> int:
 
 
 def _settings(group: str, name: str) -> type[Model]:
-    """Return the class of a plug-in's settings.
-
-    Raises:
-        PluginError: the plug-in cannot be used.
-    """
+    """Return the class of a plug-in's settings; raises PluginError if it cannot be used."""
     settings: type[Model]
     if group == CONTROL_LAWS:
         settings = LAWS[name]

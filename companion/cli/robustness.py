@@ -66,11 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _of_team(arguments: argparse.Namespace) -> PairRobustness:
-    """Return the campaign of a team file.
-
-    Raises:
-        ConfigError: one line per problem.
-    """
+    """Return the campaign of a team file; raises ConfigError, one line per problem."""
     if arguments.cases is not None or arguments.keep is not None or arguments.vehicle is not None:
         raise ConfigError("companion robustness: a team file takes no --cases, --keep and --vehicle")
     world = arguments.world or TEAM_WORLD
@@ -99,11 +95,7 @@ def _of_team(arguments: argparse.Namespace) -> PairRobustness:
 
 
 def _campaign(arguments: argparse.Namespace) -> Robustness:
-    """Return the campaign, after checking its configuration and its cases.
-
-    Raises:
-        ConfigError: one line per problem.
-    """
+    """Return the campaign, after checking its configuration and its cases; raises ConfigError, one line per problem."""
     if arguments.case and arguments.cases is None:
         raise ConfigError("companion robustness: --case needs --cases FILE, the file that contains the case")
     kept: Cases | None = None

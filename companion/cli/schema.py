@@ -40,11 +40,7 @@ KINDS: dict[str, Callable[[], TypeAdapter[Any]]] = {
 
 
 def _descriptions(model: type[BaseModel]) -> dict[str, str]:
-    """Return the docstring of each field.
-
-    Pydantic's `use_attribute_docstrings` reads them, too, but in each process that imports the models, and from their source code:
-    that took a quarter of the start of a flight.
-    """
+    """Return the docstring of each field. Pydantic's `use_attribute_docstrings` would read the source at each start of a flight."""
     found: dict[str, str] = {}
     for base in reversed(model.__mro__):
         if issubclass(base, Model) and base is not Model:
@@ -70,9 +66,7 @@ class Described(GenerateJsonSchema):
 
 
 class _Brief(Described):
-    """Generates schemas without field titles, which would repeat the keys, and with the schema of a vector's elements given only
-    once.
-    """
+    """Generates schemas without field titles, which repeat the keys, and with the schema of a vector's elements only once."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         """Return False: fields get no title."""

@@ -64,13 +64,9 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _loaded(arguments: argparse.Namespace) -> TeamConfig:
-    """Return the checked configuration of both members.
-
-    Raises:
-        ConfigError: the files have problems, the members do not go together, or one cannot fly its part.
-    """
+    """Return the checked configuration of both members; raises ConfigError if the files, or the members together, have problems."""
     if arguments.sitl not in (None, "stub", "px4"):
-        raise ConfigError([f"companion team: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4"])
+        raise ConfigError(f"companion team: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
     team = load_team(
         arguments.team,
         arguments.overrides,

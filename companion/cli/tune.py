@@ -51,11 +51,7 @@ def run_command(arguments: argparse.Namespace) -> int:
 
 
 def _tune(arguments: argparse.Namespace) -> Tune:
-    """Return the search, after checking its configuration.
-
-    Raises:
-        ConfigError: one line per problem.
-    """
+    """Return the search, after checking its configuration; raises ConfigError, one line per problem."""
     for override in arguments.overrides:
         if override.partition("=")[0].strip() == "world.seed":
             raise ConfigError("companion tune: --set world.seed: the search sets this key; use --seed")

@@ -94,7 +94,6 @@ class Session:
         self.arguments = arguments
         self.vehicle = load_vehicle(arguments.vehicle, arguments.overrides)
         self.console = console_on(sys.stderr if family.guides_on_stderr or arguments.json else sys.stdout)
-        """Console for instructions and progress."""
 
     def say(self, text: str, style: str = "") -> None:
         """Print one line of instructions."""
@@ -198,11 +197,7 @@ def _may_write(session: Session, family: Family, patch: Patch) -> bool:
 
 
 def row_lines(rows: Sequence[Row], brief: Mapping[str, str]) -> list[str]:
-    """Return the rows as lines: result, title, measured value, and the remedy if a row is not ok.
-
-    Args:
-        brief: see `Report.brief`.
-    """
+    """Return the rows as lines: result, title, measured value, and the remedy if a row is not ok."""
     lines, hidden, wrong = [], Counter[str](), set()
     for row in rows:
         group = row.id.rpartition(".")[0]
@@ -241,9 +236,7 @@ def add_tool(
     Args:
         name: name of the tool, its key in `TOOLS`.
         module: module of `TOOLS`; imported when the tool runs.
-        description: description with the exit codes.
         write: help of `--write`; empty if the tool has no such option.
-        yes: whether the tool has `--yes`.
     """
     parser: argparse.ArgumentParser = parts.add_parser(name, help=help, description=description)
     parser.add_argument(

@@ -79,7 +79,6 @@ def _with_rod(link: ChainLink, tool: Tool, end_m: Vec3, tip: Quat) -> ChainLink:
 
 
 def _along(start_m: Vec3, attitude: Quat, length_m: float) -> Vec3:
-    """Return the point at this distance from another one along the x axis of an attitude."""
     x, y, z = quat_rotate(attitude, (length_m, 0.0, 0.0))
     return (start_m[0] + x, start_m[1] + y, start_m[2] + z)
 
@@ -89,7 +88,6 @@ def _diagonal(moments: Vec3) -> Mat3:
 
 
 def _turned(attitude: Quat, moments: Vec3) -> Mat3:
-    """Return the inertia of a body with these moments about the axes of an attitude."""
     if attitude == IDENTITY_QUAT:
         return _diagonal(moments)
     rotation = rotation_matrix(attitude)
@@ -111,9 +109,7 @@ def _bodies(arm: Arm) -> Iterator[ChainLink]:
 
 
 def _rods(arm: Arm) -> Iterator[ChainLink]:
-    """Yield rods along x, in line with each other at angle 0. Unless an axis is given, the first joint turns about +y, and the others
-    turn about -y.
-    """
+    """Yield rods along x, in line at angle 0. Unless an axis is given, the first joint turns about +y and the others about -y."""
     position: Vec3 = arm.shoulder_body_m
     usual: Vec3 = (0.0, 1.0, 0.0)
     lists = (arm.armatures_kg_m2, arm.link_lengths_m, arm.link_masses_kg, arm.link_com_m)

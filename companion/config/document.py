@@ -81,7 +81,6 @@ class Document:
     values: dict[Location, Origin] = field(default_factory=dict)
     """Origins of values; a value whose location is not listed has the origin of its nearest parent."""
     keys: dict[Location, Origin] = field(default_factory=dict)
-    """Origins of keys."""
     problems: list[Problem] = field(default_factory=list)
     """Problems found while the file was read; validation adds further problems."""
 

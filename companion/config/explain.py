@@ -107,7 +107,7 @@ def _value_problem(
         if kind == "union_tag_not_found":
             return problem(RANK_MISSING, document.origin(at), at, f"missing; expected {expected}")
         value = document.find(at)
-        text = f"expected {expected}, got {_show(value)}{_did_you_mean(str(value), tags)}"
+        text = f"expected {expected}, got {_show(value)}{did_you_mean(str(value), tags)}"
         return problem(RANK_VALUE, document.origin(at), at, text)
     value = document.find(at)
     expected = describe(node, schema) if node is not None else str(detail["msg"])
@@ -200,7 +200,7 @@ def _hint(value: Data, node: _Node | None) -> str:
     if options:
         if not isinstance(value, str) and any(isinstance(option, str) and option == str(value) for option in options):
             return " (put it in quotes)"
-        return _did_you_mean(value, [str(option) for option in options]) if isinstance(value, str) else ""
+        return did_you_mean(value, [str(option) for option in options]) if isinstance(value, str) else ""
     if isinstance(value, str) and wanted.get("type") in ("number", "integer"):
         if re.fullmatch(r"\s*[-+]?[0-9]+,[0-9]+\s*", value):
             return f" (write {value.strip().replace(',', '.')})"
@@ -212,7 +212,8 @@ def _hint(value: Data, node: _Node | None) -> str:
     return ""
 
 
-def _did_you_mean(word: str, options: list[str]) -> str:
+def did_you_mean(word: str, options: list[str]) -> str:
+    """Return a suggestion of the option most similar to `word`, in brackets after a space, or an empty string."""
     close = nearest(word, options)
     return f" (did you mean {close}?)" if close else ""
 
@@ -251,9 +252,7 @@ def _step(node: _Node, step: str | int) -> _Node | None:
 
 
 def _walk(schema: _Node, loc: tuple[str | int, ...]) -> tuple[Location, _Node | None, _Node | None]:
-    """Return the location in the document for Pydantic's location, which also contains union tags, and the schema nodes of the value
-    and of its parent.
-    """
+    """Return the location in the document for Pydantic's (which has union tags too), and the schema nodes of value and parent."""
     node: _Node | None = _resolve(schema, schema)
     parent: _Node | None = None
     at: list[str | int] = []

@@ -22,7 +22,7 @@ from companion.config.document import (
     key_path,
     problem_lines,
 )
-from companion.config.explain import nearest, validate
+from companion.config.explain import did_you_mean, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
 from companion.config.phase import phase_classes
@@ -220,9 +220,7 @@ def _rename_phase_keys(document: Document) -> None:
 
 
 def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
-    """Replace the names of poses in a mission by the vehicle's joint angles, and check the number of angles; without a valid vehicle,
-    a name is replaced by an empty pose.
-    """
+    """Replace poses' names in a mission by joint angles (empty without a valid vehicle), and check the number of angles."""
     phases = document.find(("phases",))
     places: list[Location] = [("start", "arm_deg")]
     places += [("phases", index, "arm_deg") for index in range(len(phases) if isinstance(phases, list) else 0)]
@@ -245,7 +243,6 @@ def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
 
 
 def _check_controller(document: Document, overrides: list[Override], lines: list[str]) -> ControllerConfig | None:
-    """Apply the overrides to a controller file and validate it with the model of its law."""
     _override(document, "controller", overrides, lines)
     law = document.find(("law",))
     if isinstance(law, str) and law in LAWS:
@@ -254,9 +251,7 @@ def _check_controller(document: Document, overrides: list[Override], lines: list
     if law is None:
         document.report(("law",), f"missing; {expected}", RANK_MISSING)
     else:
-        close = nearest(str(law), list(LAWS))
-        hint = f" (did you mean {close}?)" if close else ""
-        document.report(("law",), f"{expected}, got {json.dumps(law)}{hint}")
+        document.report(("law",), f"{expected}, got {json.dumps(law)}{did_you_mean(str(law), list(LAWS))}")
     lines += problem_lines(document.problems)
     return None
 
@@ -344,19 +339,15 @@ def _open_controller(law: str | None, preset: str | None) -> Document:
         document = read_controller(law)
         own = document.data.get("preset")
         if preset not in (None, own):
-            raise ConfigError(
-                [f"--preset {preset}: the file {law} has the gains {json.dumps(own)}; leave --preset out"]
-            )
+            raise ConfigError(f"--preset {preset}: the file {law} has the gains {json.dumps(own)}; leave --preset out")
         return document
     if law not in PRESETS:
         raise ConfigError(
-            [f"--controller {law}: no such controller; available: {', '.join(PRESETS)}, or a file (*.yaml, *.onnx)"]
+            f"--controller {law}: no such controller; available: {', '.join(PRESETS)}, or a file (*.yaml, *.onnx)"
         )
     if LAWS[law].needs_file:
-        raise ConfigError(
-            [f"control law '{law}' has no presets: name its file in place of the law, such as {law}.onnx"]
-        )
+        raise ConfigError(f"control law '{law}' has no presets: name its file in place of the law, such as {law}.onnx")
     preset = preset or PRESETS[law][-1]
     if preset not in PRESETS[law]:
-        raise ConfigError([f"--preset {preset}: no such preset of '{law}'; available: {', '.join(PRESETS[law])}"])
+        raise ConfigError(f"--preset {preset}: no such preset of '{law}'; available: {', '.join(PRESETS[law])}")
     return read_document(near(preset_file(law, preset)))

@@ -76,10 +76,10 @@ def _parse(text: str) -> Override:
     name = name.strip()
     origin = Origin(f"--set {name}")
     if not equals:
-        raise ConfigError([f"{origin}: no '='; {_EXAMPLE}"])
+        raise ConfigError(f"{origin}: no '='; {_EXAMPLE}")
     section, location = _location(name, origin)
     if not value_text.strip():
-        raise ConfigError([f"{origin}: no value; {_EXAMPLE}"])
+        raise ConfigError(f"{origin}: no value; {_EXAMPLE}")
     return Override(section, location, parse_value(value_text, origin), origin)
 
 
@@ -99,42 +99,38 @@ def _location(name: str, origin: Origin) -> tuple[Section, Location]:
     while end < len(name):
         match = _STEP.match(name, end)
         if match is None or (match[0].startswith(".") != bool(steps) and match[1] is not None):
-            raise ConfigError([f"{origin}: cannot read the key from column {end + 1}; {_EXAMPLE}"])
+            raise ConfigError(f"{origin}: cannot read the key from column {end + 1}; {_EXAMPLE}")
         steps.append(match[1] if match[1] is not None else int(match[2]))
         end = match.end()
     if not steps:
-        raise ConfigError([f"{origin}: no key; {_EXAMPLE}"])
+        raise ConfigError(f"{origin}: no key; {_EXAMPLE}")
     section = steps[0]
     if section not in SECTIONS:
         close = nearest(str(section), list(SECTIONS))
         hint = f"did you mean {close}?" if close else f"available: {', '.join(SECTIONS)}"
-        raise ConfigError([f"{origin}: unknown section '{section}'; {hint}"])
+        raise ConfigError(f"{origin}: unknown section '{section}'; {hint}")
     if len(steps) == 1:
-        raise ConfigError([f"{origin}: the key names a whole section; {_EXAMPLE}"])
+        raise ConfigError(f"{origin}: the key names a whole section; {_EXAMPLE}")
     return section, tuple(steps[1:])
 
 
 def _make_way(document: Document, override: Override) -> None:
-    """Create the parent mappings that are missing in the file, which leaves them to their defaults; reject indices that do not
-    exist.
-    """
+    """Create the parent mappings that are missing in the file, whose keys then have their defaults; reject indices beyond it."""
     value: Data = document.data
     for depth, step in enumerate(override.location):
         last = depth == len(override.location) - 1
         here = key_path((override.section, *override.location[:depth]))
         if isinstance(step, int):
             if not isinstance(value, list):
-                raise ConfigError([f"{override.origin}: {here} is not a list"])
+                raise ConfigError(f"{override.origin}: {here} is not a list")
             if step >= len(value):
                 known = f"0 to {len(value) - 1}" if value else "none"
-                raise ConfigError([f"{override.origin}: {here} has no index {step}; available: {known}"])
+                raise ConfigError(f"{override.origin}: {here} has no index {step}; available: {known}")
             value = value[step]
         else:
             if not isinstance(value, dict):
                 raise ConfigError(
-                    [
-                        f"{override.origin}: {here} has no keys; it is {'a list' if isinstance(value, list) else 'a single value'}"
-                    ]
+                    f"{override.origin}: {here} has no keys; it is {'a list' if isinstance(value, list) else 'a single value'}"
                 )
             if last:
                 return

@@ -6,7 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 from companion.config.document import ConfigError
-from companion.config.explain import nearest
+from companion.config.explain import did_you_mean
 
 FILES = Path(str(resources.files("companion.config"))) / "files"
 """Folder of the files, with a folder for each kind."""
@@ -44,8 +44,7 @@ def named_file(folder: str, given: str | Path, option: str = "") -> Path:
     if str(given) in known:
         return shipped_file(folder, str(given))
     if str(given) and not Path(given).suffix and not Path(given).exists():
-        close = nearest(str(given), list(known))
-        hint = f" (did you mean {close}?)" if close else ""
+        hint = did_you_mean(str(given), list(known))
         what = f"{option} {given}".lstrip()
-        raise ConfigError([f"{what}: expected {', '.join(known)} or a file, found neither{hint}"])
+        raise ConfigError(f"{what}: expected {', '.join(known)} or a file, found neither{hint}")
     return Path(given)

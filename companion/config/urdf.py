@@ -103,7 +103,6 @@ class _Robot:
         self._root = root
         self._links: dict[str, _Element] = {}
         self._joints: dict[str, list[_Joint]] = {}
-        """Joints by parent link."""
         self._check_words(root)
         for element in root.children:
             if element.tag == "link":
@@ -335,9 +334,9 @@ class _Robot:
                 text = file.read(SIZE_MAX_BYTES + 1)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-            raise ConfigError([f"{self._shown}: not readable: {reason}"]) from None
+            raise ConfigError(f"{self._shown}: not readable: {reason}") from None
         if len(text) > SIZE_MAX_BYTES:
-            raise ConfigError([f"{self._shown}: larger than {SIZE_MAX_BYTES // 1024} KiB; expected a URDF file"])
+            raise ConfigError(f"{self._shown}: larger than {SIZE_MAX_BYTES // 1024} KiB; expected a URDF file")
         return text
 
     def _parse(self, text: bytes) -> _Element:
@@ -373,7 +372,7 @@ class _Robot:
     def _fail(self, at: _Element | str, text: str) -> NoReturn:
         """Refuse the file, given an element or line and column."""
         position = at if isinstance(at, str) else at.position
-        raise ConfigError([f"{self._shown}:{position}: {text}"])
+        raise ConfigError(f"{self._shown}:{position}: {text}")
 
 
 def _compose(first: _Pose, second: _Pose) -> _Pose:

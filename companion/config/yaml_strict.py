@@ -90,31 +90,29 @@ def read_document(path: str | Path, shown_as: str | None = None) -> Document:
         with Path(path).open("rb") as file:
             raw = file.read(SIZE_MAX_BYTES + 1)
     except FileNotFoundError:
-        raise ConfigError([f"{shown}: no such file"]) from None
+        raise ConfigError(f"{shown}: no such file") from None
     except IsADirectoryError:
-        raise ConfigError([f"{shown}: is a directory, expected a YAML file"]) from None
+        raise ConfigError(f"{shown}: is a directory, expected a YAML file") from None
     except PermissionError:
-        raise ConfigError([f"{shown}: not readable: permission denied"]) from None
+        raise ConfigError(f"{shown}: not readable: permission denied") from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        raise ConfigError([f"{shown}: not readable: {reason}"]) from None
+        raise ConfigError(f"{shown}: not readable: {reason}") from None
     if len(raw) > SIZE_MAX_BYTES:
-        raise ConfigError([f"{shown}: larger than {SIZE_MAX_BYTES // 1024} KiB; expected a configuration file"])
+        raise ConfigError(f"{shown}: larger than {SIZE_MAX_BYTES // 1024} KiB; expected a configuration file")
     try:
         text = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         raise ConfigError(
-            [f"{shown}:{line}: not UTF-8 (byte 0x{raw[error.start]:02x}); save the file as UTF-8"]
+            f"{shown}:{line}: not UTF-8 (byte 0x{raw[error.start]:02x}); save the file as UTF-8"
         ) from None
     document = Document(shown, {})
     data = _parse(text, document, None)
     if data is None:
-        raise ConfigError([f"{shown}: is empty"])
+        raise ConfigError(f"{shown}: is empty")
     if not isinstance(data, dict):
-        raise ConfigError(
-            [f"{document.origin(())}: expected a mapping (key: value) at the top level, got {_kind(data)}"]
-        )
+        raise ConfigError(f"{document.origin(())}: expected a mapping (key: value) at the top level, got {_kind(data)}")
     document.data = data
     return document
 
@@ -126,7 +124,7 @@ def parse_value(text: str, origin: Origin) -> Data:
         ConfigError: the value is invalid; the exception has one line per problem.
     """
     if len(text) > SIZE_MAX_BYTES:
-        raise ConfigError([f"{origin}: longer than {SIZE_MAX_BYTES // 1024} KiB"])
+        raise ConfigError(f"{origin}: longer than {SIZE_MAX_BYTES // 1024} KiB")
     document = Document(origin.source, {})
     data = _parse(text, document, origin)
     if document.problems:
@@ -135,9 +133,7 @@ def parse_value(text: str, origin: Origin) -> Data:
 
 
 def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
-    """Convert text to plain data. If `fixed` is given, as for an override, it is the origin of all values in place of line and
-    column.
-    """
+    """Convert text to plain data. `fixed`, as for an override, is the origin of all values in place of line and column."""
 
     def origin(mark: yaml.Mark | None) -> Origin:
         if fixed is not None or mark is None:
@@ -148,16 +144,16 @@ def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
     if strange is not None:
         start, name = strange.start(1), unicodedata.name(strange[1]).lower()
         mark = yaml.Mark("", start, text.count("\n", 0, start), start - text.rfind("\n", 0, start) - 1, None, 0)
-        raise ConfigError([f"{origin(mark)}: not YAML: {name} (U+{ord(strange[1]):04X}); write an ordinary space"])
+        raise ConfigError(f"{origin(mark)}: not YAML: {name} (U+{ord(strange[1]):04X}); write an ordinary space")
     try:
         node = _composed(text)
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
         at = fixed or Origin(document.source, before.count("\n") + 1, error.position - (before.rfind("\n") + 1) + 1)
         code = error.character if isinstance(error.character, int) else ord(error.character)
-        raise ConfigError([f"{at}: not YAML: control character U+{code:04X} is not allowed"]) from None
+        raise ConfigError(f"{at}: not YAML: control character U+{code:04X} is not allowed") from None
     except yaml.MarkedYAMLError as error:
-        raise ConfigError([f"{origin(error.problem_mark or error.context_mark)}: not YAML: {_syntax(error)}"]) from None
+        raise ConfigError(f"{origin(error.problem_mark or error.context_mark)}: not YAML: {_syntax(error)}") from None
     return None if node is None else _Builder(document, origin).build(node, ())
 
 
@@ -239,9 +235,7 @@ class _Builder:
 
 
 def _is_unicode(text: str) -> bool:
-    """Return whether the text is valid Unicode. An escape such as "\\uD800" leaves half of a UTF-16 pair, which JSON and terminals
-    reject.
-    """
+    """Return whether the text is valid Unicode; an escape such as "\ud800" leaves half of a UTF-16 pair, which JSON rejects."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -250,11 +244,7 @@ def _is_unicode(text: str) -> bool:
 
 
 def _scalar(text: str) -> Data:
-    """Return the value of a plain scalar by the core schema of YAML 1.2.
-
-    Raises:
-        ValueError: the scalar is a number with too many digits.
-    """
+    """Return the value of a plain scalar by the core schema of YAML 1.2; raises ValueError for a number with too many digits."""
     if _NULL.fullmatch(text):
         return None
     if _BOOL.fullmatch(text):

@@ -27,14 +27,12 @@ class Dropped(NamedTuple):
 
     asked: GroundCommand
     why: str
-    """Reason for the operator."""
 
 
 class TickCommand(NamedTuple):
     """The command of one tick."""
 
     command: OperatorCommand
-    """Command for the core."""
     asked: GroundCommand | None
     """The ground station's command that this tick executes and answers; None if there is none."""
     refused: str | None = None
@@ -46,11 +44,7 @@ class StartCancelled(Exception):
 
 
 class Operator:
-    """Collects commands from the launcher's messages, signals to this process, and the ground station.
-
-    Args:
-        channel: channel to the launcher.
-    """
+    """Collects commands from the launcher's messages, signals to this process, and the ground station."""
 
     def __init__(self, channel: socket.socket) -> None:
         self._channel = channel
@@ -119,10 +113,6 @@ class Operator:
     def judged(self, command: OperatorCommand, outputs: Outputs) -> int | None:
         """Update `hold`, the number of the active hold, and return it. A new hold begins with `SafetyAction.HOLD`, and with every
         hold command during it.
-
-        Args:
-            command: command of the tick.
-            outputs: the core's outputs of the tick.
         """
         if outputs.phase_kind is not PhaseKind.GROUND:
             self.recheck = None

@@ -138,7 +138,6 @@ class Flight:
         )
 
     def _schedule_read(self, due_s: float) -> None:
-        """Schedule the read of the joint state for the tick that is due at `due_s`."""
         arm = self._devices.arm
         if arm is not None:
             arm.begin_read(due_s - min(JOINT_LEAD_MAX_S, arm.read_takes_s + JOINT_MARGIN_S))
@@ -202,7 +201,6 @@ class Flight:
         return inputs, outputs, sent
 
     def _answer(self, asked: GroundCommand, refused: str | None, outputs: Outputs) -> None:
-        """Report the verdict on a command to its sender, the log and the launcher."""
         if refused is not None:
             self._tell_asker(asked, False, refused, outputs)
         elif (verdict := outputs.verdict) is not None:
@@ -217,9 +215,7 @@ class Flight:
         ipc.send(self._channel, done)
 
     def _goes_on(self, outputs: Outputs) -> bool:
-        """Report how a flight with a PX4 that was found armed goes on. Return False if PX4 has disarmed since, which ends the
-        flight.
-        """
+        """Report how a flight with a PX4 found armed goes on; return False if PX4 has disarmed since, which ends the flight."""
         goes_on = any(event.id == ARMED_EXTERNALLY for event in outputs.events)
         lines = [f"landing without this device: {line}" for line in self._devices.failures]
         if not goes_on:
@@ -257,7 +253,6 @@ class Flight:
         ipc.send(self._channel, GroundText(text))
 
     def _report_ground(self) -> None:
-        """Report the state of the link to ground stations when it changes."""
         client = self._recorder.client
         gone = client.gone and client.telemetry_status is not None
         ground = (

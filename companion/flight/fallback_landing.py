@@ -39,9 +39,6 @@ async def land_without_core(
     """Command PX4 to land and monitor it, without interfering with a pilot. PX4 disarms by itself (COM_DISARM_LAND).
 
     Args:
-        autopilot: open driver.
-        channel: channel to the launcher.
-        clock: the flight clock.
         guardian: connection that receives heartbeats of this process.
 
     Returns:

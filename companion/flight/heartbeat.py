@@ -105,7 +105,6 @@ class HeartbeatSender:
     """The flight process's connection to the guardian; sends it a heartbeat in each tick.
 
     Args:
-        client: connection to the guardian.
         identity: identity of the MAVLink link that the guardian would take over.
         origin_s: `companion.runtime.clock.monotonic` when the flight clock was zero.
     """

@@ -73,11 +73,7 @@ async def fly(
     """Open the devices, fly, and close them.
 
     Args:
-        config: checked configuration.
-        out: folder of the flight.
-        channel: channel to the launcher.
         guardian_channel: channel to the guardian; None if there is no guardian.
-        sitl: whether the devices are simulated.
 
     Raises:
         DeviceError: a device is missing or does not meet the requirements; nothing was armed.

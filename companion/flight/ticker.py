@@ -46,8 +46,6 @@ class Ticker:
     therefore always about half to one and a half periods apart.
 
     Args:
-        period_s: period of the ticks.
-        clock: the flight clock.
         frame_rate_hz: rate of motion capture; frames are ignored if it is 0 or too far from the tick rate.
     """
 
@@ -55,7 +53,8 @@ class Ticker:
         self._period_s = period_s
         self._clock = clock
         self._rides = abs(frame_rate_hz * period_s - 1.0) <= MATCH
-        self._due_s = clock() + period_s
+        self.due_s = clock() + period_s
+        """Time at which the next tick is expected to begin."""
         self._frame_s: float | None = None
         """Arrival of the newest frame since the last tick."""
         self._in_place_s = -math.inf
@@ -71,43 +70,38 @@ class Ticker:
         if self._waiter is not None and not self._waiter.done() and self._in_place(arrived_s):
             self._waiter.set_result(None)
 
-    @property
-    def due_s(self) -> float:
-        """Return when the next tick is expected to begin."""
-        return self._due_s
-
     async def next(self) -> TickTime:
         """Wait for the next frame or deadline."""
         self._skip()
         if self._frame_s is None or not self._in_place(self._frame_s):  # else the loop has just served its sockets
             await self._frame_or_deadline()
         start_s, frame_s = self._clock(), self._frame_s
-        behind_s = start_s - self._due_s
+        behind_s = start_s - self.due_s
         if frame_s is not None:
             if self._in_place(frame_s):
                 behind_s = start_s - frame_s
             # Relative to the nearest deadline: the frame may have arrived just after a tick that did not wait for it.
-            error_s = math.remainder(frame_s - self._due_s, self._period_s)
+            error_s = math.remainder(frame_s - self.due_s, self._period_s)
             if -EARLY_S <= error_s <= LATE_S:
                 self._in_place_s = frame_s
-            self._due_s += max(-_SLEW_S, min(_SLEW_S, _GAIN * error_s))
+            self.due_s += max(-_SLEW_S, min(_SLEW_S, _GAIN * error_s))
             self._frame_s = None
-        self._due_s += self._period_s
+        self.due_s += self._period_s
         return TickTime(start_s, max(0.0, behind_s))
 
     def _in_place(self, frame_s: float) -> bool:
-        return -EARLY_S <= frame_s - self._due_s <= LATE_S
+        return -EARLY_S <= frame_s - self.due_s <= LATE_S
 
     def _skip(self) -> None:
-        late_periods = int((self._clock() - self._due_s) / self._period_s)
+        late_periods = int((self._clock() - self.due_s) / self._period_s)
         if late_periods > 0:
             self.skipped += late_periods
-            self._due_s += late_periods * self._period_s
+            self.due_s += late_periods * self._period_s
 
     async def _frame_or_deadline(self) -> None:
         now_s = self._clock()
-        waits = self._due_s - self._in_place_s < _PATIENCE * self._period_s
-        deadline_s = self._due_s + LATE_S if waits else self._due_s
+        waits = self.due_s - self._in_place_s < _PATIENCE * self._period_s
+        deadline_s = self.due_s + LATE_S if waits else self.due_s
         loop = asyncio.get_running_loop()
         waiter = self._waiter = loop.create_future()
         timer = loop.call_later(max(0.0, deadline_s - now_s), _wake, waiter)
@@ -123,28 +117,24 @@ class SimulatedTicker:
 
     If each of the last `_SLOW_TICKS` took more than a period of processor time, as on no vehicle that may fly, a tick is late by what
     the fastest of them took. A single slow tick says nothing: the time in which a virtual machine stands still is counted as well.
-
-    Args:
-        period_s: period of the ticks.
-        clock: the flight clock.
     """
 
     def __init__(self, period_s: float, clock: Clock) -> None:
         self._period_s = period_s
         self._clock = clock
-        self._due_s = period_s * math.floor(clock() / period_s)
+        self.due_s = period_s * math.floor(clock() / period_s)
         self._begun_cpu_s = 0.0
         self._took_s = deque([0.0], maxlen=_SLOW_TICKS)
         self.skipped = 0
 
     async def next(self) -> TickTime:
         """Wait until the next tick is due."""
-        self._due_s += self._period_s
-        late_periods = int((self._clock() - self._due_s) / self._period_s)
+        self.due_s += self._period_s
+        late_periods = int((self._clock() - self.due_s) / self._period_s)
         if late_periods > 0:
             self.skipped += late_periods
-            self._due_s += late_periods * self._period_s
-        due_s = self._due_s
+            self.due_s += late_periods * self._period_s
+        due_s = self.due_s
         await asyncio.sleep(max(0.0, due_s - self._clock()))
         start_s = self._clock()
         self._begun_cpu_s = time.thread_time()

@@ -37,9 +37,7 @@ class Changes:
     """Changes that an installation makes."""
 
     entries: Mapping[str, Entry]
-    """All entries of the record, by path."""
     now: Mapping[str, PathState]
-    """Current content of each path."""
     folders: tuple[str, ...]
     """Folders to create, outermost first."""
 
@@ -148,9 +146,7 @@ def install(root: Path, plan: Plan, user: str, report: Report) -> bool:
 
 
 def _roll_back(root: Path, found: Changes, record: Record | None, made: Record) -> str:
-    """Restore the state from before this installation and remove the users in `made`, which it created. Return what could not be
-    restored.
-    """
+    """Restore the state from before this installation, remove the users `made` by it, and return what could not be restored."""
     trouble = []
     for path in reversed(found.to_do):
         try:
@@ -297,11 +293,7 @@ def _service_active() -> bool:
 
 
 def _run(command: Command, report: Report) -> None:
-    """Run a command.
-
-    Raises:
-        InstallError: a required command failed.
-    """
+    """Run a command; raises InstallError if a required one failed."""
     tool = shutil.which(command.argv[0], path=_TOOLS)
     why = ""
     if tool is None:

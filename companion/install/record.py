@@ -36,7 +36,6 @@ class Record:
     folders: tuple[str, ...] = ()
     """Folders that the installation created, outermost first."""
     users: tuple[str, ...] = ()
-    """Users that the installation created."""
     joined: tuple[str, ...] = ()
     """Existing users that the installation added to the dialout group."""
     complete: bool = False

@@ -139,16 +139,12 @@ def udev_rules(arm_serial: str | None, force_serial: str | None) -> str:
 
 
 def limits() -> str:
-    """Return the limits file: real-time priority and locked memory for members of the dialout group who fly from a shell. A
-    service has its own limits.
-    """
+    """Return the limits file: real-time priority and locked memory for members of dialout in a shell; a service has its own."""
     return f"{_HEAD}\n@dialout - rtprio {RTPRIO}\n@dialout - memlock unlimited\n"
 
 
 def modules() -> str:
-    """Return the modules-load.d file with the drivers to load at boot: a service's DeviceAllow covers only drivers that are
-    loaded when it starts.
-    """
+    """Return the modules-load.d file with the drivers to load at boot: a service's DeviceAllow covers only loaded drivers."""
     return f"{_HEAD}\nftdi_sio\ncdc_acm\n"
 
 

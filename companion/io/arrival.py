@@ -33,7 +33,6 @@ def arrived_s(notes: list[tuple[int, int, bytes]], clock: Clock) -> float:
 
     Args:
         notes: ancillary data of `recvmsg`, read with a buffer of `STAMP_ROOM_BYTES`.
-        clock: the flight clock.
 
     Returns:
         The current time if there is no kernel timestamp, or if the wall clock has been set since.

@@ -21,7 +21,6 @@ class DeviceThread:
     """Opens a device, serves it until it is stopped, and closes it, all in one thread. It can be started once.
 
     Args:
-        name: name of the thread.
         open_device: opens the device; returns an error instead of raising it.
         serve: exchanges data with the device until `stopping` is set.
         close_device: closes the device, whether or not it was opened; never raises.

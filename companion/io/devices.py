@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 from companion.config.arm import Arm as ArmConfig
 from companion.config.arm import Jaws
@@ -26,6 +27,7 @@ from companion.model.flight_stage import is_armed
 from companion.model.types import MocapPose
 from companion.runtime.clock import Clock
 
+_T = TypeVar("_T")
 STATUS_TIMEOUT_S = 2.5
 """Timeout for PX4's status, which needs a heartbeat; PX4 sends one per second."""
 ARM_TIMEOUT_S = 1.5
@@ -96,8 +98,7 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
     async with contextlib.AsyncExitStack() as stack:
         problem: DeviceError | None = None
         try:
-            if (system := _mocap(config, clock, available)) is not None:
-                available.mocap = await stack.enter_async_context(system)
+            available.mocap = await _opened(stack, _mocap(config, clock, available))
         except DeviceError as error:
             problem = error
         try:
@@ -109,9 +110,8 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
             failures = [] if problem is None else [str(problem)]
             arm: Arm | None = None
             try:
-                if (driver := _arm(config, clock)) is not None:
-                    async with asyncio.timeout(ARM_TIMEOUT_S):
-                        arm = await stack.enter_async_context(driver)
+                async with asyncio.timeout(ARM_TIMEOUT_S):
+                    arm = await _opened(stack, _arm(config, clock))
             except DeviceError as error:
                 failures.append(str(error))
             except TimeoutError:
@@ -119,8 +119,7 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
                 failures.append(f"arm {device.port or device.type}: not open within {ARM_TIMEOUT_S:g} s")
             team: Team | None = None
             try:
-                if (link := _team(config, clock)) is not None:
-                    team = await stack.enter_async_context(link)
+                team = await _opened(stack, _team(config, clock))
             except DeviceError as error:
                 failures.append(str(error))
             if ground_address is not None:
@@ -140,17 +139,10 @@ async def open_devices(config: FlightConfig, clock: Clock) -> AsyncIterator[Devi
             return
         if problem is not None:
             raise problem
-        force = None
-        if (sensor := _force(config, clock)) is not None:
-            force = await stack.enter_async_context(sensor)
-        team = None
-        if (link := _team(config, clock)) is not None:
-            team = await stack.enter_async_context(link)
-        ground = None
-        if ground_address is not None:
-            ground = await stack.enter_async_context(_ground(config, ground_address, autopilot))
-        driver = _arm(config, clock)
-        arm = await stack.enter_async_context(driver) if driver is not None else None
+        force = await _opened(stack, _force(config, clock))
+        team = await _opened(stack, _team(config, clock))
+        ground = await _opened(stack, None if ground_address is None else _ground(config, ground_address, autopilot))
+        arm = await _opened(stack, _arm(config, clock))
         yield Devices(
             forwarder=forwarder, autopilot=autopilot, mocap=mocap, arm=arm, force=force, team=team, ground=ground
         )
@@ -163,8 +155,6 @@ async def open_available(
     """Open the devices that can be opened and list the errors of the others.
 
     Args:
-        config: addresses and settings.
-        clock: the flight clock.
         show: called with the name of each device before it is opened, for the operator.
     """
     available = AvailableDevices(PoseForwarder())
@@ -192,6 +182,12 @@ async def open_available(
         yield available
 
 
+async def _opened(
+    stack: contextlib.AsyncExitStack, device: contextlib.AbstractAsyncContextManager[_T] | None
+) -> _T | None:
+    return None if device is None else await stack.enter_async_context(device)
+
+
 async def _is_armed(autopilot: Autopilot) -> bool:
     """Return whether PX4 is armed; False if no status arrives, because then nothing can take off."""
     with contextlib.suppress(TimeoutError):
@@ -202,7 +198,6 @@ async def _is_armed(autopilot: Autopilot) -> bool:
 
 
 def _force(config: FlightConfig, clock: Clock) -> ForceTorque | None:
-    """Return the driver of the force sensor, or None if the vehicle has none."""
     device = config.vehicle.devices.force
     return open_force(device, clock) if device is not None else None
 
@@ -232,7 +227,6 @@ def _mocap(config: FlightConfig, clock: Clock, available: AvailableDevices) -> M
 
 
 def _team(config: FlightConfig, clock: Clock) -> TeamLink | None:
-    """Return the link to the other vehicle, or None if the vehicle flies alone."""
     device = config.vehicle.devices.team
     return None if device is None else TeamLink(TeamSettings(**device.model_dump()), clock)
 
@@ -259,7 +253,6 @@ def open_arm(device: ArmDevice, arm: ArmConfig, clock: Clock, jaws: Jaws | None 
     return DynamixelArm(device, arm, clock, jaws) if device.type == DYNAMIXEL else PluginArm(device, arm, clock)
 
 
-def _arm(config: FlightConfig, clock: Clock) -> DynamixelArm | PluginArm | None:
-    """Return the driver of the arm, or None if the vehicle has none."""
+def _arm(config: FlightConfig, clock: Clock) -> Arm | None:
     vehicle = config.vehicle
     return open_arm(vehicle.arm_device, vehicle.arm, clock, vehicle.jaws) if vehicle.arm.joints else None

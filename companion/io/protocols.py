@@ -38,9 +38,7 @@ from companion.model.types import (
 
 
 class DeviceError(Exception):
-    """A device is missing or is not as expected. The exception's text is one line: device, address, expected, found, and how to fix
-    it.
-    """
+    """A device is missing or not as expected. One line: device, address, expected, found, and how to fix it."""
 
 
 class Device(Protocol):

@@ -25,7 +25,6 @@ class Reopening(Generic[T]):
     the control tick must not.
 
     Args:
-        name: name of the thread.
         open_device: opens the device and sends nothing to it; raises an exception while that is impossible.
     """
 

@@ -74,9 +74,6 @@ def read_key(settings: TeamSettings) -> bytes:
 class TeamSender:
     """Sends this vehicle's state, from any port.
 
-    Args:
-        settings: addresses and key.
-
     Raises:
         DeviceError: address or key is missing, the key is too short, or there is no way to the other vehicle.
     """
@@ -106,7 +103,6 @@ class TeamSender:
         """Send the state, unless less than `PERIOD_S` have passed since the last; never waits.
 
         Args:
-            said: state.
             t_s: time on any clock that increases.
         """
         if t_s < self._due_s:
@@ -125,19 +121,13 @@ class TeamSender:
 
 
 class TeamLink:
-    """The flight process's end of the link; implements `companion.io.protocols.Team`.
-
-    Args:
-        settings: addresses and key.
-        clock: the flight clock.
-    """
+    """The flight process's end of the link; implements `companion.io.protocols.Team`."""
 
     def __init__(self, settings: TeamSettings, clock: Clock) -> None:
         self._settings, self._clock = settings, clock
         self._simulated = simulated_time.current()
         self._counts = LinkCounts()
         self._counter = -1
-        """Counter of the newest datagram."""
         self._arriving: list[PartnerState] = []
         """Announcements in the order of their arrival, the newest last; those of the future have not arrived yet."""
         self._newest: PartnerState | None = None

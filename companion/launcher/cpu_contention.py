@@ -38,7 +38,6 @@ class ProcessWait:
     """How long a process waited for a core."""
 
     process: str
-    """Name of the process, for the message."""
     share: float
     """Waiting time of the thread that waited longest, as a fraction of the elapsed time, 0 to 1."""
 

@@ -120,10 +120,6 @@ class GuardianProcess:
         self.receive()
         self.channel.close()
 
-    def kill(self) -> None:
-        """Kill the guardian at once."""
-        self.process.kill()
-
     def failure(self) -> str | None:
         """Return one line on how the guardian failed, or None if it did not."""
         code = self.process.returncode

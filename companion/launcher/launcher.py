@@ -74,9 +74,7 @@ class FlightResult:
     world: dict[str, Any] = field(default_factory=dict)
     """True state of the simulated world: payload_kg, caught, crashed, ..."""
     events: tuple[dict[str, Any], ...] = ()
-    """Events that the flight process reported, in the format of summary.json. The log contains them too, unless the recorder
-    died.
-    """
+    """Events that the flight process reported, in the format of summary.json; the log has them too, unless the recorder died."""
     guardian_events: tuple[dict[str, Any], ...] = ()
     """Events of the guardian in the format of summary.json; empty if it did not take over."""
     pace: float | None = None
@@ -99,7 +97,6 @@ class Launcher:
         out: existing folder for all files of the flight.
         sitl: autopilot of the simulated world; None for hardware.
         speed: simulated seconds in a second of real time at most, with SITL; None for a flight in real time.
-        on_message: called with every message of the processes, for the display.
         world: with SITL, the running world of several vehicles; None to start one.
     """
 
@@ -116,7 +113,6 @@ class Launcher:
         self._speed = speed if sitl is not None else None
         self._world = world
         self._time: SharedTime | None = None
-        """Simulated time; None in real time."""
         self._flown_from: tuple[float, float] | None = None
         """Simulated time and wall time of the first status message."""
         self._pace: float | None = None
@@ -266,7 +262,7 @@ class Launcher:
                 for said in sitl.messages(0.0):
                     self._on_message(said)
                 if sitl.ended:  # nothing is left to land
-                    guardian.kill()
+                    guardian.process.kill()
                     process.kill()
                     return
             for message in guardian.receive():
@@ -292,7 +288,7 @@ class Launcher:
             alone_s = now_s - flight_open_s
             if guardian.hangs() or (not guardian.took_over and alone_s > GUARDIAN_EXIT_TIMEOUT_S):
                 self._reports.failures.append("guardian: the guardian process hung and was killed")
-                guardian.kill()
+                guardian.process.kill()
                 return
 
     def _now_s(self) -> float:
@@ -353,9 +349,7 @@ class Launcher:
         self._reports.events.append(busy.for_summary())
 
     def _await_recorder(self) -> None:
-        """Wait for the recorder to close the log if the flight process was killed. The recorder is not a child of this process,
-        so its pidfd is polled.
-        """
+        """Wait for the recorder to close the log if the flight process was killed; its pidfd is polled, as it is no child."""
         if self._reports.recorder_pid is None or self._reports.result is not None:
             return
         try:

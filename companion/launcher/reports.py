@@ -73,8 +73,6 @@ class FlightReports:
 
         Args:
             code: exit code of the flight process.
-            log_path: its log.
-            guardian: the guardian.
             sitl: the simulated world; None with hardware.
             stop_requested: whether the user has requested a landing.
         """
@@ -107,12 +105,7 @@ class FlightReports:
         return outcome
 
     def user_lines(self, outcome: Outcome, busy: str | None) -> tuple[str, ...]:
-        """Return why the flight was refused, which process failed and where its log is.
-
-        Args:
-            outcome: the flight's outcome.
-            busy: that the computer was busy; None if it was not.
-        """
+        """Return why the flight was refused, which process failed and where its log is."""
         if outcome is not Outcome.REFUSED:
             return tuple(self.failures)
         reasons = self._refused
@@ -127,7 +120,6 @@ class FlightReports:
 
 
 def _takeover_summary(guardian: GuardianProcess, code: int, log_path: Path) -> str:
-    """Return one line on how the flight process and the flight ended."""
     vehicle = {
         Outcome.ABORTED: "the guardian landed the vehicle",
         Outcome.CRASHED: "the vehicle was flipped or tipped over, and the guardian stopped its rotors",

@@ -37,11 +37,7 @@ def run_flight(
     """Run a flight, write its summary and, if requested, its report; return the exit code.
 
     Args:
-        config: checked configuration.
-        out: folder of the flight.
         sitl: as for `Launcher`.
-        console: where to print.
-        report: whether to write the report.
         speed: as for `Launcher`.
     """
     where = config.vehicle.name if sitl is None else "SITL" if sitl == "stub" else "a real PX4 in SITL"
@@ -124,17 +120,13 @@ def summary_of(
 
 
 def autopilot_of(log: FlightLog | None, world: dict[str, Any]) -> dict[str, Any]:
-    """Return the autopilot's kind (stub or px4), its version and what the world reports about it; on hardware, the version that
-    PX4 reported.
-    """
+    """Return the autopilot's kind (stub or px4), version and the world's report about it; on hardware, PX4's own version."""
     firmware = None if log is None else log.metadata.get("autopilot", {}).get("firmware")
     return {"kind": "px4", "version": firmware, "firmware": firmware, **world.get("autopilot", {})}
 
 
 def report_of(log: FlightLog, summary: dict[str, Any], out: Path) -> Path | None:
-    """Write report.html with its plots and return its path. Return None if matplotlib, which a flight does not need, is not
-    installed.
-    """
+    """Write report.html with its plots and return its path; None without matplotlib, which a flight does not need."""
     try:
         from companion.analysis.report import write_report
     except ImportError:

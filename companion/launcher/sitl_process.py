@@ -36,7 +36,6 @@ class SitlProcess:
         process: the process, which vehicles of one world share.
         told: pipe on which the world hears about this flight.
         said: pipe on which the world speaks about this vehicle.
-        log: the world's log.
         px4: whether the world flies a real PX4.
         time: simulated time of the flight; None for a world in real time.
     """
@@ -66,10 +65,7 @@ class SitlProcess:
         """Start the world of one vehicle.
 
         Args:
-            config: checked configuration.
-            out: folder of the flight.
             speed: simulated seconds in a second of real time at most; None for a world in real time.
-            px4: whether the world flies a real PX4.
 
         Raises:
             LaunchError: the kernel gives no shared memory or no sockets.
@@ -162,9 +158,7 @@ class SitlProcess:
         return f"sitl: the simulated world {how_it_ended(self.process.returncode)}{last_line(self.log)}; see {self.log}"
 
     def messages(self, deadline_s: float) -> Iterator[WorldMessage]:
-        """Yield the world's messages until the deadline (`time.monotonic`) or the end of the process. With deadline 0, yield only
-        those that have already arrived.
-        """
+        """Yield the world's messages until the deadline (`time.monotonic`; 0: those that have arrived) or the process's end."""
         for line in self._lines.read(deadline_s):
             try:
                 message: WorldMessage = from_jsonable(cast(Any, WorldMessage), line)

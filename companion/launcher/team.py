@@ -75,7 +75,6 @@ class TeamLauncher:
 
     Args:
         worlds: the world, as each member sees it.
-        launchers: launcher of each member.
     """
 
     def __init__(self, worlds: Sequence[SitlProcess], launchers: Sequence[Launcher]) -> None:
@@ -126,10 +125,7 @@ def run_team(
     """Fly a team in the simulated world, write the summaries and, if requested, the reports; return the exit code.
 
     Args:
-        team: checked configuration.
         out: existing folder of the flight; each member has a folder in it.
-        console: where to print.
-        report: whether to write the report of each member.
         speed: simulated seconds in a second of real time at most; None for a flight in real time.
         px4: whether two real PX4 fly in place of two stubs.
     """

@@ -48,9 +48,7 @@ class ActiveTrajectory:
         return self.change is not None and self.change.after == 0.0
 
     def pace(self, t_s: float) -> tuple[float, float, float, float]:
-        """Return the plan time at `t_s` on the flight clock, its rate (1: as the flight clock, 0: held), and the first and second
-        derivatives of the rate.
-        """
+        """Return the plan time at `t_s` on the flight clock, its rate (1: as the clock, 0: held) and the rate's two derivatives."""
         change = self.change
         if change is None:
             return t_s - self.start_s, 1.0, 0.0, 0.0
@@ -80,9 +78,7 @@ class ActiveTrajectory:
         return self._turned_to(1.0, t_s) if self.held else self
 
     def moved_to(self, plan_s: float, t_s: float) -> ActiveTrajectory:
-        """Return the course with another plan time at `t_s`, held if this one is held. Unless it is held, the plan must be at rest at
-        both times.
-        """
+        """Return the course with another plan time at `t_s`, held if this one is; otherwise the plan rests at both times."""
         if not self.held:
             return replace(self, start_s=t_s - plan_s, change=None)
         change = Change(begin_s=t_s, plan_s=plan_s, duration_s=STOP_MIN_S, before=0.0, after=0.0)

@@ -54,7 +54,6 @@ class Expectation(Record, frozen=True):
     chase: ChaseState | None = None
     """The way to a thrown ball, for the log."""
     clamp: ClampCommand | None = None
-    """Command for the clamp; None to leave it as it is."""
     grip: Grip = Grip.FREE
     """What the vehicle has in its clamp, for the other vehicle of a team."""
     together: Together = Together()
@@ -105,13 +104,9 @@ class Air:
     """One tick of a phase with a state of its own; `companion.core.phase_tick` implements it.
 
     Args:
-        o: inputs of the tick.
-        vehicle: the vehicle file.
-        manipulator: kinematics of the arm.
         phases: phases of the mission (`companion.mission.phase.Phase`).
         segment: segment at the plan's time.
         engaged: segment of the phase whose state it is; after a hold, the plan's time may have passed its end.
-        limits: limits of the mission.
         safe: the governor's safe set.
         nominal: whether the supervisor has not reacted to anything so far.
         holds: whether it has reacted by a hold or more; a mere warning stops no plan.

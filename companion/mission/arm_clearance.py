@@ -86,7 +86,6 @@ class ArmClearance:
         return max(contacts, key=lambda contact: contact.depth_m, default=None)
 
     def _contact(self, part: str, from_m: Vec3, to_m: Vec3, radius_m: float, number: int) -> Contact | None:
-        """Return the contact of a rod with one rotor."""
         rotor_x_m, rotor_y_m, rotor_z_m = self._rotors_body_m[number]
         low_m = rotor_z_m - ROTOR_GAP_M - radius_m
         low, high = sorted((from_m, to_m), key=lambda point: point[2])

@@ -40,7 +40,6 @@ class JerkLimited:
     """A profile from 0 at u = 0 to 1 at u = 1, at rest at both ends, made of consecutive cubics; implements `Profile`."""
 
     knots: tuple[float, ...]
-    """Start of each cubic."""
     cubics: tuple[tuple[float, float, float, float], ...]
     """f, f', f'' / 2, f''' / 6 at the start of each cubic."""
 
@@ -80,7 +79,6 @@ def plan_arm(delta_rad: Joints, limits: ArmLimits, duration_s: float = 0.0) -> A
     Args:
         delta_rad: displacement of each joint; not all zero.
         limits: speed limit of each joint; acceleration and jerk limits common to all.
-        duration_s: requested minimum duration.
 
     Raises:
         ValueError: Ruckig rejects the input. Finite angles and positive limits are always accepted.

@@ -36,9 +36,7 @@ def landing_with_bar(
 
     Args:
         now: the last reference.
-        velocity_world_m_s: initial velocity.
         stands_m: height of the clamp at which the bar stands.
-        manipulator: kinematics of the arm.
         arm_fold_rad: joint angles at the end.
         speed_m_s: speed of the descent, the same for both vehicles.
         vehicle: provides the height of the floor.

@@ -46,8 +46,6 @@ def check_mission(
     tether, which adds up.
 
     Args:
-        mission: the mission to check.
-        vehicle: vehicle, tether and room.
         start_position_world_m: measured position of the body's origin; None for the mission's start, on the floor.
         start_yaw_rad: measured yaw; None for the mission's value.
         start_arm_rad: measured joint angles as in the paper; None for the mission's values.
@@ -140,15 +138,12 @@ def _samples(segment: Segment) -> Iterator[float]:
 def check_start(
     mission: Mission, vehicle: Vehicle, position_world_m: Vec3, yaw_rad: float, arm_rad: Joints | None
 ) -> list[str]:
-    """Return only the reasons that depend on the measured start; fast enough for a control tick. The arguments are those of
-    `check_mission`.
-    """
+    """Return only the reasons that depend on the measured start, fast enough for a tick; arguments of `check_mission`."""
     found = _start(mission, vehicle, position_world_m, yaw_rad, arm_rad)
     return [f"mission '{mission.name}': {text}" for text in found]
 
 
 def _start(mission: Mission, vehicle: Vehicle, position: Vec3, yaw_rad: float, arm_rad: Joints | None) -> Iterator[str]:
-    """Check the vehicle's position, yaw and arm against the mission's start."""
     start = mission.start
     x_m, y_m = start.position_m
     away_m = math.dist(position[:2], start.position_m)
@@ -191,7 +186,6 @@ def _speed(mission: Mission, vehicle: Vehicle) -> Iterator[str]:
 
 
 def _of_phases(mission: Mission, vehicle: Vehicle, plan: Plan, phase_origins: Sequence[str]) -> Iterator[str]:
-    """Check what each type of phase needs."""
     phases = phases_of(mission)
     for segment in plan.segments:
         if segment.repetition < 2:

@@ -43,7 +43,6 @@ class Checking:
     mission: Mission
     vehicle: Vehicle
     begin: Reference
-    """Reference at the start of the phase."""
     end: Reference
     earlier: Sequence[Phase]
     """Phases before this one in the mission, the newest last."""

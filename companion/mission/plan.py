@@ -133,7 +133,6 @@ class Plan:
         return self.segments[index - 1 if index else 0]
 
     def _repeated(self, t_s: float, repeats: Repeats) -> Segment:
-        """Return the segment at a time within a repetition after the second."""
         before = repeats.before(t_s)
         shift_s = before * repeats.period_s
         # The shift is rounded: just after the seam the shifted time may lie just before it.
@@ -177,7 +176,6 @@ def landing_from(
         yaw_rad: kept constant.
         arm_rad: joint angles at the start, at rest.
         arm_fold_rad: joint angles at the end.
-        speed_m_s: speed of the descent.
         vehicle: provides the height of the floor and the reach of the arm.
         back_to_m: position to go to before everything else, from a surface that the tool may touch.
     """

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TypeAlias
 
-from companion.model.types import Joints, Reference, Vec3
+from companion.model.types import Reference
 
 Shape: TypeAlias = tuple[float, float, float, float]
 """f, f', f'', f''' of a profile at u in [0, 1]."""
@@ -24,9 +24,7 @@ Septic: TypeAlias = tuple[float, float, float, float, float, float, float, float
 
 
 def minimum_snap(u: float) -> Shape:
-    """Return the profile that minimises the integral of f'''' squared, with f', f'' and f''' zero at both ends: 35 u^4 - 84 u^5 + 70
-    u^6 - 20 u^7.
-    """
+    """Return the profile of least integral of f'''' squared, with f' to f''' zero at both ends: 35 u^4 - 84 u^5 + 70 u^6 - 20 u^7."""
     u2 = u * u
     u3 = u2 * u
     return (
@@ -38,9 +36,7 @@ def minimum_snap(u: float) -> Shape:
 
 
 def rest_to_rest(u: float) -> Shape:
-    """Return the quintic from 0 to 1 with zero velocity and acceleration at both ends: 10 u^3 - 15 u^4 + 6 u^5. Peak f' = 1.875, peak
-    f'' = 5.774.
-    """
+    """Return the quintic from 0 to 1, at rest at both ends: 10 u^3 - 15 u^4 + 6 u^5. Peak f' = 1.875, peak f'' = 5.774."""
     u2 = u * u
     return (
         u2 * u * (10.0 + u * (6.0 * u - 15.0)),
@@ -210,21 +206,4 @@ def reference_at(position: Track, yaw: Track, arm: Track, t_s: float) -> Referen
         arm_rate_rad_s=arm_rate_rad_s,
         arm_acceleration_rad_s2=arm_acceleration_rad_s2,
         jerk_world_m_s3=(jx, jy, jz),
-    )
-
-
-def at_rest(position_world_m: Vec3, yaw_rad: float, arm_rad: Joints) -> Reference:
-    """Return a constant reference."""
-    zero3: Vec3 = (0.0, 0.0, 0.0)
-    still = (0.0,) * len(arm_rad)
-    return Reference(
-        position_world_m=position_world_m,
-        velocity_world_m_s=zero3,
-        acceleration_world_m_s2=zero3,
-        yaw_rad=yaw_rad,
-        yaw_rate_rad_s=0.0,
-        arm_rad=arm_rad,
-        arm_rate_rad_s=still,
-        arm_acceleration_rad_s2=still,
-        jerk_world_m_s3=zero3,
     )

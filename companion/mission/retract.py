@@ -57,7 +57,6 @@ def retract_from(
         arm_rad: joint angles at the start, at rest.
         arm_fold_rad: joint angles at the end.
         vehicle: provides room, airframe and the speed of the return.
-        tether: its anchor and length.
         back_to_m: position to go to before everything else, from a surface that the tool may touch.
     """
     safety, anchor = vehicle.safety, tether.anchor_world_m
@@ -92,11 +91,7 @@ def retract_from(
 
 
 def _never_outward(velocity_m_s: Vec3, duration_s: float, position_m: Vec3, anchor_m: Vec3) -> Vec3:
-    """Return the velocity turned inward just far enough that the straight path to the point of rest never leads away from the
-    anchor's vertical.
-
-    With the distance r at the start, a path of n inward and t sideways never leads outward if n (r - n) >= t^2.
-    """
+    """Return the velocity turned inward so far that the path to rest never leads outward: n (r - n) >= t^2, n inward, t across."""
     x, y = position_m[0] - anchor_m[0], position_m[1] - anchor_m[1]
     away_m = math.hypot(x, y)
     if away_m < 1e-6:

@@ -70,9 +70,7 @@ class SampleCheck:
         self._blow_until_s = 0.0
 
     def turns_in_the_end(self, repetitions: int) -> float:
-        """Return the largest number of turns of the tether in the last repetition. Each repetition after the second winds it as much as
-        the second.
-        """
+        """Return the most turns of the tether in the last repetition; each after the second winds it as much as the second."""
         if not self._windings:
             return 0.0
         most = 0.0
@@ -88,9 +86,7 @@ class SampleCheck:
 
         Args:
             t_s: time on the plan's clock.
-            reference: the plan's reference at that time.
             jerks: jerk of the vehicle, world frame, m/s^3, and of the joints, rad/s^3.
-            kind: kind of the phase.
         """
         clearance_m = self._vehicle.airframe.ground_clearance_m
         x_m, y_m, z_m = reference.position_world_m

@@ -27,9 +27,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Repeats:
-    """Repetitions after the second. They are not planned: the second is replayed in their place, each time from where the previous
-    repetition ended.
-    """
+    """Repetitions after the second, which are not planned: the second is replayed from where the previous one ended."""
 
     count: int
     """Number of all repetitions, 3 or more."""
@@ -43,9 +41,7 @@ class Repeats:
 
     @property
     def left_out_s(self) -> float:
-        """Return the total duration of the repetitions after the second, s. They are not planned: the second is replayed in their
-        place.
-        """
+        """Return the total duration of the repetitions after the second, s, in whose place the second is replayed."""
         return (self.count - 2) * self.period_s
 
     @property
@@ -54,9 +50,7 @@ class Repeats:
         return self.begin_s + self.period_s + self.left_out_s
 
     def before(self, t_s: float) -> int:
-        """Return how many periods to subtract from this time to obtain the corresponding time in the second repetition: 0 before the
-        third, `count` - 2 after the last.
-        """
+        """Return by how many periods the second repetition was before this time: 0 before the third, `count` - 2 after the last."""
         whole = int((t_s - self.begin_s) / self.period_s)
         return 0 if whole < 1 else min(whole, self.count - 2)
 

@@ -44,9 +44,7 @@ def skeleton_of(chain: ArmChain) -> ArmSkeleton:
 
 
 def logged_skeleton(vehicle: Any) -> ArmSkeleton | None:
-    """Return the skeleton of arm and tool in the section `vehicle` of a logged configuration (docs/arm.md); None if it has no valid
-    arm.
-    """
+    """Return the skeleton of arm and tool in the section `vehicle` of a logged configuration; None if it has no valid arm."""
     arm = vehicle.get("arm") if isinstance(vehicle, dict) else None
     if not isinstance(arm, dict):
         return None

@@ -152,11 +152,7 @@ def differences(a: object, b: object, path: str = "") -> tuple[str, object, obje
 
 
 def _from_numpy(value: Any) -> Any:
-    """Convert a NumPy scalar or array in a record to a Python number or list.
-
-    Raises:
-        TypeError: the value has a type that records do not support.
-    """
+    """Convert a NumPy scalar or array in a record to a Python number or list; raises TypeError for an unsupported type."""
     tolist = getattr(value, "tolist", None)
     if tolist is None:
         raise TypeError(f"a record cannot contain a {type(value).__name__}")
@@ -184,9 +180,7 @@ def _refused(cls: Any, error: Exception) -> RecordError:
 
 
 def _mended(value: Any, *, spell_floats: bool) -> Any:
-    """Return the data in a form that every parser accepts: "?" replaces characters without a UTF-8 form (half of a surrogate pair) and,
-    if `spell_floats`, strings replace non-finite floats.
-    """
+    """Return the data for any parser: "?" for half of a surrogate pair and, with `spell_floats`, strings for non-finite floats."""
     if isinstance(value, float) and spell_floats and not math.isfinite(value):
         return repr(value)
     if isinstance(value, str):
@@ -199,11 +193,7 @@ def _mended(value: Any, *, spell_floats: bool) -> Any:
 
 
 def _schema(hint: Any) -> dict[str, Any]:
-    """Return the JSON Schema of one field's type.
-
-    Raises:
-        TypeError: a record's field cannot have this type.
-    """
+    """Return the JSON Schema of one field's type; raises TypeError for a type that a record's field cannot have."""
     if hint in _LEAVES:
         return {"type": _LEAVES[hint]}
     if isinstance(hint, type) and issubclass(hint, Enum):

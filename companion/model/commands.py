@@ -26,7 +26,6 @@ class CommandRow(NamedTuple):
     per_s: int
     """Maximum number that is accepted from one operator in a second; a flood of one command does not block another."""
     what: str
-    """What it does, for the operator."""
 
 
 TABLE: Final = (

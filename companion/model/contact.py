@@ -94,7 +94,6 @@ class ContactState(Record, frozen=True, kw_only=True):
     """Shift of the reference per push that keeps the tip in place, m/N, world frame."""
     touches: int
     touched_offset_m: float
-    """Offset at the last touch."""
     failed: bool
     """Whether the contact ended before its planned end."""
     disagreement_bias_n: float = 0.0

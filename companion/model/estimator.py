@@ -18,9 +18,7 @@ class EstimatorReport(Record, frozen=True, kw_only=True):
     flags: int
     """Bit mask of ESTIMATOR_STATUS_FLAGS."""
     velocity_ratio: float
-    """Innovation test ratio of the velocity. Such a ratio is below 1 if the measurements are accepted, and exactly 0 if nothing is
-    fused.
-    """
+    """Innovation test ratio of the velocity; such a ratio is below 1 if measurements are accepted, exactly 0 if none is fused."""
     position_horizontal_ratio: float
     position_vertical_ratio: float
     position_horizontal_accuracy_m: float

@@ -102,7 +102,5 @@ def is_killed(status: AutopilotStatus | None) -> bool:
 
 
 def flown_by_pilot(status: AutopilotStatus | None) -> bool:
-    """Return whether a pilot has control: PX4 is armed, and in a mode that a pilot has chosen or with its rotors stopped by the kill
-    switch. Nothing is sent to PX4 then.
-    """
+    """Return whether a pilot has control: PX4 is armed, in a pilot's mode or stopped by the kill switch; nothing is sent then."""
     return status is not None and status.armed and (chosen_by_pilot(status) or is_killed(status))

@@ -67,7 +67,6 @@ class MocapCounts(Record, frozen=True, kw_only=True):
     """Counts of the motion-capture driver since it was opened."""
 
     frames: int
-    """Frames that yielded a pose."""
     superseded: int
     """Frames that were read together with a newer frame and therefore not delivered."""
     out_of_order: int

@@ -52,9 +52,7 @@ class ControlLog(Record, frozen=True, kw_only=True):
     sliding: Chi
     gamma: Chi
     tau: Chi
-    """Generalised force after saturation: N in rows 0 to 2, N m in rows 6 and above. Rows 3 to 5 are 0, because PX4 controls the
-    attitude.
-    """
+    """Generalised force after saturation: N in rows 0 to 2, N m from row 6; rows 3 to 5 are 0, because PX4 controls attitude."""
     e_tau: Chi
     h_hat: Vec4
     zeta: float

@@ -41,7 +41,6 @@ class CommandAnswer(Record, frozen=True, kw_only=True, tag=True):
 
     number: int
     nonce: str
-    """Nonce of the command."""
     operator: str
     """Name of the operator who signed the command."""
     command: OperatorCommand

@@ -14,9 +14,7 @@ class TickTimes:
         self._frame_s: float | None = None
 
     def take(self, inputs: Inputs, sent: Sent) -> dict[str, float]:
-        """Return the durations that are known with the next tick, s, by the fields of `companion.analysis.timing.Timing`, and
-        `mocap_age_s`, the time from the frame's exposure to the tick.
-        """
+        """Return the durations known with the next tick, s, by the fields of `analysis.timing.Timing`, and `mocap_age_s`."""
         sent_s = end_s(sent)
         found = {
             "lateness_s": sent.lateness_s,

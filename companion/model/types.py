@@ -177,9 +177,7 @@ class AutopilotStatus(Record, frozen=True, kw_only=True):
     battery_remaining: float | None = None
     """Remaining charge, 0 to 1, of the emptiest battery; None if PX4 does not report it."""
     battery_stamp_s: float | None = None
-    """Arrival of the newest BATTERY_STATUS of the battery that has been silent for the longest time; None if none has arrived, and in
-    older logs.
-    """
+    """Arrival of the newest BATTERY_STATUS of the battery silent for longest; None if none has arrived, and in older logs."""
     system_status: int | None = None
     """HEARTBEAT.system_status (MAV_STATE); None in older logs."""
     radio: bool | None = None

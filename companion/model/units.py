@@ -11,15 +11,12 @@ UNITS: Final = {
     "kg": "kg", "kg_m": "kg m", "kg_m2": "kg m^2", "n": "N", "n_m": "N/m", "n_per_m": "N/m", "per_n_m": "m/N", "g_per_m": "g/m",
     "nm": "N m", "nms": "N m s", "nm_a": "N m/A", "a": "A", "v": "V", "c": "degC", "wxyz": "unit quaternion w, x, y, z",
 }  # fmt: skip
-"""Units by suffix."""
 _WITHOUT: Final = frozenset({"row_weights_s"})
 """Names without a unit that nevertheless end like a unit."""
 
 
 def split_unit(name: str, units: dict[str, str] = UNITS) -> tuple[str, str | None]:
-    """Split a name before its longest suffix in `units`: `duration_ms` gives ("duration", "ms"); a name without a unit gives
-    (name, None).
-    """
+    """Split a name before its longest suffix in `units`: `duration_ms` gives ("duration", "ms"), without a unit (name, None)."""
     words = name.split("_")
     for count in (3, 2, 1):
         suffix = "_".join(words[-count:]).lower()

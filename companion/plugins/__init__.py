@@ -83,9 +83,7 @@ def one_line(error: BaseException) -> str:
 
 @functools.cache
 def installed(group: str) -> dict[str, Plugin]:
-    """Return the installed plug-ins of a group by name: first the companion's own, then those of other distributions in order of
-    name.
-    """
+    """Return the installed plug-ins of a group by name: the companion's own, then other distributions' in order of name."""
     found: dict[str, Plugin] = {}
     for plugin in [*_own(group), *sorted(_of_others(group), key=lambda plugin: plugin.entry.name)]:
         first = found.setdefault(plugin.entry.name, plugin)
@@ -107,9 +105,7 @@ def find(group: str, name: str) -> Plugin:
 
 
 def _own(group: str) -> Iterator[Plugin]:
-    """Yield the companion's own parts. In a source tree they are read from pyproject.toml, because an editable installation keeps the
-    entry points that existed when it was made.
-    """
+    """Yield the companion's own parts; a source tree's from pyproject.toml, as an editable installation keeps old entry points."""
     import tomllib  # 0.1 s with importlib.metadata, which a guardian for NatNet does without
     from importlib.metadata import EntryPoint, entry_points
 

@@ -281,7 +281,6 @@ def _equal(check: Check, values: Sequence[str], wanted: str, fix: str) -> Row:
 
 
 def _each(values: Sequence[object]) -> str:
-    """Return one value as text if all servos have it, else the value of each."""
     return str(values[0]) if len(set(values)) == 1 else " and ".join(map(str, values))
 
 

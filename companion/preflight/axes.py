@@ -55,9 +55,7 @@ class AxisMap:
         return (a * true[i], b * true[j], c * true[k])
 
     def rotation(self, true: Quat) -> Quat:
-        """Convert a true rotation R to the streamed rotation A R A', for a server that permutes the body axes too. The result is a
-        rotation even if A is a reflection.
-        """
+        """Convert a true rotation R to the streamed R A R', of a server that permutes the body axes too; a rotation for any A."""
         x, y, z = self.vector((true[1], true[2], true[3]))
         d = self.determinant
         return (true[0], d * x, d * y, d * z)

@@ -16,9 +16,7 @@ class Check:
     """Identity and texts of one check."""
 
     id: str
-    """Id of its row."""
     title: str
-    """Title of its row."""
     wanted: str = ""
     """Expected result in general terms, for the table of checks in the docs. The row states the actual limits."""
     why: str = ""

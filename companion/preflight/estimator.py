@@ -156,9 +156,7 @@ def _rates(o: Observations) -> Row:
 
 
 def _lag(o: Observations, vehicle: Vehicle) -> Row:
-    """Return the row on delays over the whole observation: arrival time minus PX4's own time stamp, relative to the smallest
-    difference.
-    """
+    """Return the row on delays over the whole observation: arrival minus PX4's own stamp, relative to the smallest difference."""
     offsets_s = sorted(state.attitude_stamp_s - state.boot_s for state in o.vehicle if state.boot_s is not None)
     late_s = offsets_s[int(0.99 * (len(offsets_s) - 1))] - offsets_s[0]
     limit_s = vehicle.safety.link_lag_max_s

@@ -318,9 +318,7 @@ def _accelerometer(force_m_s2: Vec3) -> Row:
 
 
 def _px4(at: Pose, states: tuple[VehicleState, ...], vehicle: Vehicle) -> Iterator[Row]:
-    """Return the rows that compare PX4's attitude with motion capture. Only the newest half of PX4's states is used, because its
-    filter may have just started.
-    """
+    """Return the rows on PX4's attitude against motion capture, by the newest half of its states: its filter may be new."""
     estimate = mean_attitude([state.attitude_wxyz for state in states[len(states) // 2 :]])
     tilt_deg = math.degrees(angle_rad(quat_rotate(estimate, _UP), quat_rotate(at.attitude, _UP)))
     read, wanted = f"{tilt_deg:.1f} deg apart", f"within {TILT_MAX_DEG:g} deg"

@@ -246,9 +246,7 @@ def _error(poses: tuple[MocapPose, ...]) -> Row:
 
 
 def _clock(poses: tuple[MocapPose, ...], vehicle: Vehicle) -> Row:
-    """Return the row on a least-squares fit of arrival time over frame number: the slope is the server's frame period by the
-    companion's clock, and the residual is jitter.
-    """
+    """Return the row on a fit of arrival time over frame number: the slope is the server's period, the residual is jitter."""
     first = poses[0]
     n = [pose.frame_number - first.frame_number for pose in poses]
     t = [pose.stamp_s - first.stamp_s for pose in poses]

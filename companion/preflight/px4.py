@@ -46,9 +46,7 @@ def rows(firmware: str | None, params: Mapping[str, Value], vehicle: Vehicle) ->
 
 
 def firmware_row(firmware: str) -> Row:
-    """Return the row of the firmware, such as `PX4 1.16.1 release (git ...)`: 1.16 and 1.18 pass, older than 1.15 fails,
-    others warn.
-    """
+    """Return the row of the firmware, such as `PX4 1.16.1 release (git ...)`: 1.16 and 1.18 pass, before 1.15 fails, others warn."""
     wanted = "1.16.x or 1.18.x, a release"
 
     def row(ok: bool, level: Level = Level.WARN, fix: str = "") -> Row:

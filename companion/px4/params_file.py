@@ -199,7 +199,6 @@ def text(
     """Return the text of a parameter file.
 
     Args:
-        values: values by name.
         heading: comment lines at the top of the file, without `#`.
         comments: comment lines before a parameter, by its name, without `#`.
         vehicle_id: MAV_SYS_ID of the PX4 with these values.

@@ -15,9 +15,7 @@ circle, neighbours are 0.77 apart."""
 
 
 def geometry_of(airframe: Airframe) -> dict[str, Value]:
-    """Return the parameters CA_ROTORi_* of a vehicle: positions relative to the body origin (FRD, m), and the moment ratio KM, positive
-    for a counter-clockwise rotor.
-    """
+    """Return a vehicle's CA_ROTORi_*: positions from the body origin (FRD, m), and KM, positive for counter-clockwise rotors."""
     layout, found = airframe.rotor_layout, dict[str, Value]()
     for index, ((x, y, z), spin) in enumerate(zip(layout.positions_body_m, layout.spins, strict=True)):
         found[f"CA_ROTOR{index}_PX"] = x

@@ -17,7 +17,6 @@ KNOWN_GOOD: tuple[Release, ...] = ((1, 16), (1, 18))
 LAST: Mapping[str, Release] = {"COM_KILL_DISARM": (1, 17), "EKF2_GPS_DELAY": (1, 17), "SIM_BAT_ENABLE": (1, 17)}
 """The last version that has a parameter. In 1.18 SENS_GPS0_DELAY and SENS_GPS1_DELAY, and SIM_BAT_DRAIN 0, take their places."""
 FIRST: Mapping[str, Release] = {"SENS_GPS0_DELAY": (1, 18), "SENS_GPS1_DELAY": (1, 18), "MC_REF_W_N": (1, 18)}
-"""The first version that has a parameter."""
 
 
 def has(name: str, release: Release) -> bool:

@@ -33,9 +33,7 @@ class Wanted:
     fix: str = ""
     """Remedy, if it is not simply to set the parameter."""
     hardware: bool = False
-    """Whether the parameter belongs to the serial port TELEM2. Such parameters are checked only on a serial link, because PX4's
-    simulator lacks some of them.
-    """
+    """Whether it belongs to the port TELEM2 and is checked on a serial link only, because PX4's simulator lacks some of these."""
     file: bool = True
     """Whether the parameter is in configs/px4/indoor_mocap.params."""
     measured: bool = False

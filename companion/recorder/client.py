@@ -55,7 +55,8 @@ class RecorderClient:
         self._socket.setblocking(False)
         _enlarge(self._socket)
         self._offered = 0
-        self._dead = False
+        self.gone = False
+        """Whether the recorder process has ended."""
         self.samples = 0
         self.dropped = 0
         self.error: str | None = None
@@ -72,11 +73,6 @@ class RecorderClient:
             return taken
         self._read_messages(data)
         return taken
-
-    @property
-    def gone(self) -> bool:
-        """Whether the recorder process has ended."""
-        return self._dead
 
     def take_commands(self) -> list[GroundCommand]:
         """Return the commands since the last call, in order. The recorder has verified each: signature, age, session and nonce."""
@@ -133,14 +129,14 @@ class RecorderClient:
 
     def close(self) -> None:
         """End the log: the recorder writes the packets that it has received and closes the file."""
-        if not self._dead:
+        if not self.gone:
             self._send(Close(self._offered))
-        self._dead = True
+        self.gone = True
         self._socket.close()
 
     def _send(self, packet: Packet) -> bool:
         self._offered += 1
-        if not self._dead:
+        if not self.gone:
             try:
                 data = to_packet(packet)
                 try:
@@ -157,7 +153,7 @@ class RecorderClient:
                 self.error = f"recorder: a record could not be packed: {error}"
             except OSError as error:
                 if isinstance(error, (BrokenPipeError, ConnectionError)):
-                    self._dead = True
+                    self.gone = True
                     self.error = self.error or "recorder: the recorder process has ended; recording has stopped"
         self.dropped += 1
         return False
@@ -293,7 +289,6 @@ class RecorderProcess:
         return next(self._lines.read(deadline_s), None)
 
     def _end(self) -> int:
-        """Make sure that the process has ended; return its exit code."""
         self.client.close()
         try:
             code = self.process.wait(2.0)

@@ -86,9 +86,7 @@ class LiveViewers:
             channel.log(text, log_time=stamp_ns)
 
     def stop(self, within_s: float) -> bool:
-        """Send what waits and close the server; wait up to `within_s` for it. Return whether it is closed, which a viewer that reads
-        nothing prevents.
-        """
+        """Send what waits and close the server within `within_s`; return whether it is closed, which a stuck viewer prevents."""
         closing = threading.Thread(target=self._server.stop, name="viewers", daemon=True)
         closing.start()
         closing.join(within_s)

@@ -26,7 +26,6 @@ _LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "critical": LogLe
 _STAMP_MAX_NS = 2**32 * 1_000_000_000 - 1
 """Largest time stamp of a header, whose seconds have 32 bits."""
 _CHUNK_BYTES = 2**19
-"""Size at which a chunk is flushed."""
 
 
 class LogWriter:

@@ -38,8 +38,6 @@ class TelemetryThread:
     """The thread and its packet queue.
 
     Args:
-        config_json: effective configuration of the flight.
-        simulated: whether the devices are simulated.
         flight: connection to the flight process and to the log.
         recorder_state: returns the number of lost records, and why recording stopped; called from the thread.
     """
@@ -88,9 +86,7 @@ class TelemetryThread:
         self._ending = normally
 
     def join(self, within_s: float) -> bool:
-        """Wait up to `within_s` for the thread to end, which it does once the last message is sent or if no broker is connected.
-        Return whether it ended.
-        """
+        """Wait up to `within_s` for the thread's end, after its last message or without a broker; return whether it ended."""
         self._thread.join(within_s)
         return not self._thread.is_alive()
 

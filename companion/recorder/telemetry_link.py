@@ -30,7 +30,6 @@ from companion.recorder.telemetry_session import INFO, WARNING, Outgoing, Teleme
 from companion.runtime.tasks import until_first
 
 ANSWER_S = 4.0
-"""Timeout for each answer of the broker."""
 COMMAND_PACKET_MAX_BYTES = 16_384
 """Maximum Packet Size given to the broker: sixteen times a command, so that a somewhat oversized command is received and reported."""
 SEND_BUFFER_BYTES = 65_536
@@ -112,9 +111,7 @@ class Outbox:
             self.wake.set()
 
     def begin(self) -> None:
-        """Prepare for a new connection: queue every retained message again, because the broker may have lost it, and drop the pending
-        stream message.
-        """
+        """Prepare for a new connection: queue all retained messages again, for the broker, and drop the pending stream message."""
         self.stream = None
         self.stream_available.clear()
         self.due = dict.fromkeys(sorted(self.kept, key=lambda topic: topic is not Topic.STATE))
@@ -123,13 +120,7 @@ class Outbox:
 
 
 class Uplink:
-    """Connects a telemetry session to its broker.
-
-    Args:
-        session: builds the messages and verifies the commands.
-        access: settings of the broker.
-        recorder: interface to the rest of the recorder.
-    """
+    """Connects a telemetry session to its broker."""
 
     def __init__(self, session: TelemetrySession, access: BrokerAccess, recorder: RecorderSide) -> None:
         self._session = session
@@ -157,7 +148,6 @@ class Uplink:
             staying.cancel()
 
     async def _pump(self) -> None:
-        """Process packets and build messages, 20 times a second."""
         due_s = time.monotonic()
         while True:
             ending = self._recorder.ending()
@@ -216,11 +206,7 @@ class Uplink:
             pause_s = min(PAUSE_MAX_S, pause_s * 1.6)
 
     async def _serve(self, client: Connection) -> None:
-        """Serve one connection.
-
-        Raises:
-            aiomqtt.MqttError: the connection was lost.
-        """
+        """Serve one connection; raises aiomqtt.MqttError if it is lost."""
         self._counts.connections += 1
         self._report_change(INFO, f"connected to {self._access.address}")
         if self._session.accepts_commands:

@@ -25,11 +25,11 @@ from companion.ground.protocol.messages import (
     Presence,
     State,
     Topic,
-    encode,
 )
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import StreamBuilder, truncated
+from companion.model.codec import to_json
 from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Tick, read_packet
 from companion.model.types import Outcome, SafetyAction
 
@@ -49,7 +49,6 @@ class _Refusals:
     """Refused commands with the same reason."""
 
     count: int = 0
-    """Refusals that have not been reported."""
     text: str = ""
     reported_s: float = -math.inf
 
@@ -59,7 +58,6 @@ class Outgoing:
     """Messages to send now."""
 
     retained: dict[Topic, bytes] = field(default_factory=dict)
-    """Payload of each retained topic that changed."""
     acks: list[bytes] = field(default_factory=list)
     stream: bytes | None = None
     log: list[tuple[float, str, str]] = field(default_factory=list)
@@ -70,9 +68,7 @@ class TelemetrySession:
     """Builds the messages of one flight and verifies commands.
 
     Args:
-        config: effective configuration.
         session: random id of this flight.
-        simulated: whether the devices are simulated.
         verifier: verifies commands; None if commands are not accepted.
         no_commands: why commands are not accepted.
     """
@@ -95,7 +91,8 @@ class TelemetrySession:
         """CLOCK_MONOTONIC of the newest tick."""
         self._new_ticks = False
         self._outcome: Outcome | None = None
-        self._over = False
+        self.over = False
+        """Whether the flight has ended."""
         self._packet_error: str | None = None
         """Error of the first malformed packet (a bug); empty once it has been reported."""
         self._refusals: dict[str, _Refusals] = {}
@@ -121,7 +118,6 @@ class TelemetrySession:
         self._events_sent = -1
         self._changed = {Topic.SCENE, Topic.PREFLIGHT}
         self.refused = 0
-        """Number of refused commands."""
 
     @property
     def session(self) -> str:
@@ -133,11 +129,6 @@ class TelemetrySession:
         """Whether commands are verified and forwarded."""
         return self._verifier is not None
 
-    @property
-    def over(self) -> bool:
-        """Whether the flight has ended."""
-        return self._over
-
     def flight_s(self, now_s: float) -> float | None:
         """Return the flight clock at a CLOCK_MONOTONIC time, or None before the first tick."""
         return self._clock.now_s(now_s, self._state.simulated)
@@ -145,7 +136,7 @@ class TelemetrySession:
     def last_will(self) -> bytes:
         """Return the state that the broker publishes if this process disappears."""
         text = "the connection to the vehicle was lost"
-        return encode(replace(self._state, presence=Presence.LOST, wall_s=0.0, commands=False, text=text))
+        return to_json(replace(self._state, presence=Presence.LOST, wall_s=0.0, commands=False, text=text))
 
     def take_packet(self, received_s: float, data: bytes) -> None:
         """Process one packet of the flight's or the guardian's channel. Never raises: the log has the packet in any case."""
@@ -179,7 +170,7 @@ class TelemetrySession:
 
     def receive_command(self, payload: bytes, retained: bool, now_s: float) -> Command | None:
         """Verify a payload of the command topic; return the command if it is accepted."""
-        if self._verifier is None or self._over:
+        if self._verifier is None or self.over:
             return None
         verdict = self._verifier.check(payload, retained, self.flight_s(now_s))
         if isinstance(verdict, Accepted):
@@ -206,9 +197,9 @@ class TelemetrySession:
         Args:
             normally: True if the flight ended normally, False if its process died.
         """
-        if self._over:
+        if self.over:
             return
-        self._over = True
+        self.over = True
         outcome = self._outcome.value if self._outcome is not None else None
         if normally:
             self._set_state(presence=Presence.ENDED, commands=False, outcome=outcome, text=None)
@@ -233,20 +224,20 @@ class TelemetrySession:
         if now_s - self._state_sent_s >= STATE_PERIOD_S:
             self._state_sent_s = now_s
             self._state = replace(self._state, wall_s=round(wall_s, 3))
-            out.retained[Topic.STATE] = encode(self._state)
+            out.retained[Topic.STATE] = to_json(self._state)
         for topic, record in ((Topic.SCENE, self._scene), (Topic.PREFLIGHT, self._preflight)):
             if topic in self._changed:
-                out.retained[topic] = encode(record)
+                out.retained[topic] = to_json(record)
         self._changed.clear()
         if self._events_sent != self._stream.count:
             self._events_sent = self._stream.count
-            out.retained[Topic.EVENTS] = encode(self._stream.events_message())
+            out.retained[Topic.EVENTS] = to_json(self._stream.events_message())
         if self._new_ticks:
             self._new_ticks = False
             stream = self._stream.build(wall_s, dropped=dropped, recorder_error=recorder_error)
             keys = self._verifier.operators.keys if self._verifier is not None else ()
-            out.stream = encode(with_proofs(stream, self.vehicle, keys))
-        out.acks = [encode(self._proven(ack)) for ack in self._acks]
+            out.stream = to_json(with_proofs(stream, self.vehicle, keys))
+        out.acks = [to_json(self._proven(ack)) for ack in self._acks]
         self._acks.clear()
         out.log = list(self._log)
         self._log.clear()
@@ -271,7 +262,6 @@ class TelemetrySession:
         )  # fmt: skip
 
     def _proven(self, ack: Ack) -> Ack:
-        """Return the ack with a proof for the operator who sent the command."""
         key = self._verifier.operators.find_key(ack.operator) if self._verifier is not None else None
         return ack if key is None else with_proof(ack, self.vehicle, key)
 
@@ -289,7 +279,7 @@ class TelemetrySession:
             self._changed.add(Topic.PREFLIGHT)
 
     def _presence(self, now_s: float) -> None:
-        if self._over:
+        if self.over:
             return
         if self._tick_s is None:
             self._tick_s = now_s  # first call: ticks are expected from now on

@@ -38,9 +38,7 @@ def versions() -> dict[str, str]:
 
 
 def _git_revision() -> str | None:
-    """Return the commit of this module's working copy, with `-dirty` if it was changed, or the commit that the compiled build was
-    built from; None if neither is known.
-    """
+    """Return this working copy's commit (`-dirty` if changed) or the one of the compiled build; None if neither is known."""
     package = Path(__file__).resolve().parents[1]
     root = package.parent
     if (package / REVISION_FILE).exists():

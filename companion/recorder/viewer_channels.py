@@ -281,9 +281,7 @@ def timestamp(stamp_ns: int) -> Timestamp:
 
 
 def _vehicle_pose(inputs: Inputs) -> tuple[Vec3, Quat] | None:
-    """Return the position and the attitude from motion capture, or from PX4 if motion capture is stale, untracked or not finite. None
-    if neither is usable.
-    """
+    """Return position and attitude from motion capture, or else from PX4; None if neither is fresh, tracked and finite."""
     mocap, vehicle = inputs.mocap, inputs.vehicle
     if mocap is not None and mocap.tracking_valid and inputs.t_s - mocap.stamp_s <= _FRESH_S:
         if _usable(mocap.position_world_m, mocap.attitude_wxyz):

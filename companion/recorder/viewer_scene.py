@@ -143,7 +143,6 @@ def _segments(ends: list[Vec3], colour: Color, thickness_px: float) -> LinePrimi
 
 
 def _rod(end: Vec3) -> CylinderPrimitive:
-    """Return a cylinder from the frame's origin to a point of the frame."""
     x, y, z = end
     length_m = math.hypot(x, y, z)
     # The rotation that turns z to the direction of the end.

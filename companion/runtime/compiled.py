@@ -7,4 +7,3 @@ from __future__ import annotations
 from companion.model import frames
 
 COMPILED = not frames.__file__.endswith(".py")
-"""True in the compiled build."""

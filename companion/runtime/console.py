@@ -37,9 +37,7 @@ from companion.model.types import SafetyAction, Severity
 
 
 class SteadyStream:
-    """A text stream that never fails. If its reader has gone (a closed pipe, a terminal that hung up), further text is discarded,
-    so that the flight continues.
-    """
+    """A text stream that never fails: if its reader has gone (a closed pipe, a terminal that hung up), it discards all text."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -252,9 +250,6 @@ def print_result(
     """Print the result table and the paths of the flight's files.
 
     Args:
-        console: where to print.
-        summary: the flight's summary.
-        out: folder of the flight.
         report: the flight's report, if it was written.
         contact: names and texts of facts about a contact.
         catches: whether the mission catches a payload.
@@ -331,7 +326,6 @@ def print_team_result(console: Console, summary: dict[str, Any], path: Path) -> 
     """Print the result of two vehicles that carry a bar.
 
     Args:
-        console: where to print.
         summary: `outcome`, the worse one of both; `team`, with the figures of the bar; `members`, with the summary of each.
         path: report of the flight, or the folder of a flight without one.
     """

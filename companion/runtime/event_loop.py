@@ -121,9 +121,7 @@ async def start_over(simulated: SimulatedTime) -> None:
 
 @contextlib.contextmanager
 def real_time() -> Iterator[None]:
-    """Let simulated time run no faster than real time while the block waits for a thread that lives on the computer's clock. In real
-    time it does nothing.
-    """
+    """Let simulated time run no faster than real time while the block waits for a thread on the computer's clock."""
     simulated = simulated_time.current()
     if simulated is None:
         yield

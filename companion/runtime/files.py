@@ -20,8 +20,6 @@ def write_whole(
     """Write a file through a temporary file in the same folder, so that a failure leaves no partial file.
 
     Args:
-        path: the file.
-        data: content of the file.
         mode: permission bits; None for the default of the process (umask).
         owner: user and group id; None for those of the process.
         replace: False refuses to replace an existing file.

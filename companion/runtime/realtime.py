@@ -39,7 +39,6 @@ class Realtime:
     memory_locked: bool
     """Whether current pages, and those touched later, stay in memory (mlockall)."""
     refused: tuple[str, ...]
-    """Requests that were refused, each with the reason."""
 
     def __str__(self) -> str:
         got = [f"SCHED_FIFO {self.priority}"] if self.priority is not None else []

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
 GRANT: Final = struct.Struct("<Q")
-"""Number of the grant."""
 REPORT: Final = struct.Struct("<QdQB")
 """Number of the newest grant, `wake_s`, bytes written to the servo bus, `Flags`."""
 _PAGE_BYTES: Final = 24
@@ -228,8 +227,6 @@ def wait(waiting: select.poll, timeout_s: float, *, data: bool) -> list[tuple[in
     """Wait like `waiting.poll`, in the time that this process lives in.
 
     Args:
-        waiting: descriptors to wait on.
-        timeout_s: longest wait, s.
         data: whether a frame of motion capture ends the wait, if it is simulated time.
     """
     if _current is None:

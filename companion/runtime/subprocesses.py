@@ -100,9 +100,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file with a process id from the flight's folder if possible: the system may assign the id of an ended process to
-    another one.
-    """
+    """Remove a file with a process id from the flight's folder if possible: the system may assign that id again."""
     with contextlib.suppress(OSError):
         path.unlink()
 
@@ -150,9 +148,7 @@ class JsonLines:
         """Whether the child has closed its end, which means that it has exited or is about to."""
 
     def read(self, deadline_s: float) -> Iterator[dict[str, Any]]:
-        """Yield JSON objects until the deadline (`time.monotonic`) or the end of the pipe. With deadline 0, yield only what has already
-        arrived.
-        """
+        """Yield JSON objects until the deadline (`time.monotonic`; 0: those that have arrived) or the end of the pipe."""
         while not self.ended:
             while b"\n" in self._buffer:
                 line, _, self._buffer = self._buffer.partition(b"\n")
@@ -184,9 +180,7 @@ def holds_traceback(path: Path) -> bool:
 
 
 def last_line(path: Path) -> str:
-    """Return the last non-empty line of a log, truncated, in parentheses after a space, for example ` (ValueError: text)`; empty if
-    there is none.
-    """
+    """Return the last non-empty line of a log, truncated, as ` (ValueError: text)`; empty if there is none."""
     lines = _tail(path).split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "")
     return f" ({last[:_LINE_CHARACTERS]})" if last else ""

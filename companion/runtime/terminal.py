@@ -17,12 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 
 class Bars:
-    """Live progress bars, each followed by a text; without a terminal only the lines of `say` are printed.
-
-    Args:
-        console: console on which the bars are shown.
-        names: names of the bars.
-    """
+    """Live progress bars, each followed by a text; without a terminal only the lines of `say` are printed."""
 
     def __init__(self, console: Console, names: Sequence[str]) -> None:
         self._said = ""

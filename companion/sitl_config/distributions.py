@@ -136,16 +136,12 @@ def draw(data: dict[str, Any], ranges: Sequence[Range], seed: int) -> dict[str, 
 
     Args:
         data: plain data of a world. A range at a missing location (a section that is null, a shorter list) is ignored.
-        ranges: ranges to draw.
-        seed: seed of the world.
     """
     return _filled(data, [(one.at, one.sample(seed)) for one in ranges])
 
 
 def with_model_error(world: World, joints: int) -> World:
-    """Return the world of an arm with this number of joints, with `model_error` added to the errors of base mass, inertia, link masses
-    and torque constants.
-    """
+    """Return the world of an arm with so many joints, `model_error` added to its errors of masses, inertia and torque constants."""
     if world.model_error == 0.0:
         return world
 
@@ -217,11 +213,7 @@ def check_world(document: Document, ranges: Sequence[Range], seed: int) -> World
 
 
 def _distribution(value: dict[str, Any]) -> Distribution:
-    """Parse a distribution.
-
-    Raises:
-        ValueError: the value is not a distribution; the text is for the user.
-    """
+    """Parse a distribution; raises ValueError with a text for the user."""
     if len(value) != 1:
         raise ValueError(f"{_EXPECTED}, got a mapping with {len(value)} keys")
     ((name, pair),) = value.items()

@@ -26,12 +26,10 @@ class Kind:
     """One kind of fault."""
 
     what: str
-    """Description of the fault."""
     size: str | None = None
     """Meaning of the size; None if the kind has no size."""
     unit: str = ""
     default: float | None = None
-    """Default of the size."""
     named_by: tuple[str, ...] = ()
     """Events that report the fault or its consequence."""
     phases: tuple[FlightPhase, ...] = IN_FLIGHT

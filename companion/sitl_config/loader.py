@@ -20,7 +20,6 @@ from companion.sitl_config.per_joint import repeat_for_joints
 from companion.sitl_config.world import World
 
 WORLDS = names("worlds")
-"""Names of the built-in worlds."""
 DEFAULT_WORLD = "ideal"
 """The world of a configuration that names none."""
 RENAMED = {
@@ -36,9 +35,7 @@ COMMAND_LINE_WORLD = "lab"
 
 
 class SitlConfig(FlightConfig):
-    """A flight's configuration and the true parameters of its simulated world. The flight process and the core receive only
-    `flight`.
-    """
+    """A flight's configuration and the true parameters of its simulated world; flight process and core receive only `flight`."""
 
     world: World = World()
     laboratory: Laboratory = Laboratory()

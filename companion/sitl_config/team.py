@@ -103,17 +103,12 @@ def load_team(
 
 
 def _of_member(end: End, overrides: Sequence[str]) -> list[str]:
-    """Return the options that hold for a member."""
     named = [(text.lstrip().partition("."), text) for text in overrides]
     return [rest if head in ENDS else text for (head, _, rest), text in named if head not in ENDS or head == end]
 
 
 def _grips_of(mission: Path, document: Document) -> list[int]:
-    """Return the indices of the phases in which a member grips its end of the bar.
-
-    Raises:
-        ConfigError: the mission cannot be read, or has none.
-    """
+    """Return the indices of a member's phases of type grip; raises ConfigError if the mission is unreadable or has none."""
     phases = read_document(mission).find(("phases",))
     found = [
         index
@@ -122,9 +117,7 @@ def _grips_of(mission: Path, document: Document) -> list[int]:
     ]
     if not found:
         raise ConfigError(
-            [
-                f"{document.origin(('mission',))}: mission: {mission} has no phase of type grip, so that no team is needed"
-            ]
+            f"{document.origin(('mission',))}: mission: {mission} has no phase of type grip, so that no team is needed"
         )
     return found
 
@@ -132,7 +125,6 @@ def _grips_of(mission: Path, document: Document) -> list[int]:
 def _overrides_of(
     team: str, end: End, member: Member, document: Document, grips: Sequence[int]
 ) -> Iterator[str | Override]:
-    """Yield what a member has of its own."""
     at = document.origin(("members", end))
     for index in grips:
         yield override_of(f"mission.phases[{index}].end", end, at)

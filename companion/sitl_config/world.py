@@ -223,9 +223,7 @@ class World(Model):
 
     @property
     def thr_mdl_fac(self) -> float:
-        """Return PX4's THR_MDL_FAC: from `px4_params` if set there; otherwise from `rotors` if that effect is on, or 0 for linear
-        rotors.
-        """
+        """Return PX4's THR_MDL_FAC: from `px4_params`, else from `rotors` if that effect is on, or 0 for linear rotors."""
         return self.px4_params.get("THR_MDL_FAC", self.rotors.thr_mdl_fac if self.rotors.on else 0.0)
 
     def overridden_px4_params(self) -> dict[str, float | int]:

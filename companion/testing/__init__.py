@@ -40,7 +40,6 @@ def check_law(law: str, preset: str | None = None, vehicle: str | Path | None = 
     """Run every check on an installed control law.
 
     Args:
-        law: name of the law.
         preset: one of the law's presets; None to check all of them in turn.
         vehicle: vehicle file, or the name of a shipped one; None for the vehicle of the shipped missions.
 
@@ -86,9 +85,7 @@ def _check_hover(config: FlightConfig, label: str, arm_rad: Joints) -> None:
     weight_n = config.vehicle.airframe.mass_kg * GRAVITY_M_S2
 
     def hovering(offset_m: Vec3, airborne: bool, duration_s: float) -> tuple[float, float]:
-        """Hold the vehicle `offset_m` from the reference for `duration_s`, then at the reference for 2 s; return the thrust (fraction
-        of the weight) and the tilt (rad).
-        """
+        """Hold the vehicle `offset_m` off for `duration_s`, then at the reference for 2 s; return thrust (of weight) and tilt, rad."""
         law = build_law(config.controller, config.vehicle)
         wrench = _held(law, config.vehicle, arm_rad, offset_m, airborne, duration_s, None)
         wrench = _held(law, config.vehicle, arm_rad, (0.0, 0.0, 0.0), True, 2.0, wrench)
@@ -119,9 +116,7 @@ def _held(
     duration_s: float,
     wrench: Wrench | None,
 ) -> Wrench | None:
-    """Run the law with a constant position error and return its last command. In the air, the acceleration follows from the last
-    command.
-    """
+    """Run the law with a constant position error, accelerating as commanded in the air, and return its last command."""
     resting, reference = at_rest(arm_rad), hover(arm_rad)
     x, y, z = resting.position_world_m
     position: Vec3 = (x + offset_m[0], y + offset_m[1], z + offset_m[2])

@@ -34,7 +34,6 @@ def check_force_sensor(device: ForceDevice, absent: ForceDevice | None = None, d
     It must open, stream new finite samples at no more than 1.5 times its rate, report no overload, close, and open again.
 
     Args:
-        device: `devices.force` of the vehicle file.
         absent: the same with an address at which there is no sensor, which must be refused; None to leave that out.
         duration_s: duration for which the samples are judged.
 
@@ -57,8 +56,6 @@ def check_arm(device: ArmDevice, arm: Arm, absent: ArmDevice | None = None, dura
     twice.
 
     Args:
-        device: `devices.arm` of the vehicle file.
-        arm: `arm` of the vehicle file.
         absent: the same with an address at which there is no arm, which must be refused; None to leave that out.
         duration_s: duration for which torques are written.
 

@@ -32,7 +32,6 @@ def check_mocap(device: MocapDevice, duration_s: float = 1.0) -> None:
     are arrivals; they must close without threads left over, and open again.
 
     Args:
-        device: `devices.mocap` of the vehicle file.
         duration_s: duration for which poses are judged.
 
     Raises:

@@ -54,8 +54,6 @@ class Px4Stub:
 
     Args:
         params: parameter store; changes take effect at once.
-        estimator: substitute for EKF2.
-        cascade: attitude loop, rate loop and mixer.
         setpoint_delay_s: delay from the arrival of a setpoint to its effect in the attitude loop.
         learned: biases that PX4 has learned before the world starts; None for an IMU without bias.
     """
@@ -105,12 +103,14 @@ class Px4Stub:
         """Time from the last IMU sample to the arrival of the message being handled; set by the links."""
         self._queue: deque[tuple[float, OffboardTarget]] = deque()
         self._offboard: OffboardTarget | None = None
-        self._setpoint_at_s: float | None = None
+        self.setpoint_at_s: float | None = None
+        """World time at which the newest offboard setpoint arrived, or None."""
         self._setpoint_kind = OffboardKind.ATTITUDE
         self._next_commander_s = -math.inf
         self._position_at_s = -math.inf
         self._flying: NavState | None = None
-        self._climb_rate_controlled = False
+        self.position_controlled = False
+        """Whether the position controller computes the attitude target."""
 
     @property
     def arrival_s(self) -> float:
@@ -128,11 +128,6 @@ class Px4Stub:
         return self.commander.nav_state
 
     @property
-    def setpoint_at_s(self) -> float | None:
-        """World time at which the newest offboard setpoint arrived, or None."""
-        return self._setpoint_at_s
-
-    @property
     def fusion(self) -> Fusion:
         """Innovation test ratios and accuracy of vision."""
         return self._estimator.fusion()
@@ -141,11 +136,6 @@ class Px4Stub:
     def landed(self) -> bool:
         """Whether the land detector reports landed."""
         return self.land.landed
-
-    @property
-    def position_controlled(self) -> bool:
-        """Whether the position controller computes the attitude target."""
-        return self._climb_rate_controlled
 
     def step(self, imu: ImuSample) -> RotorCommands:
         """Advance to the sample's world time and return normalised rotor commands (0 to 1); all are zero while disarmed."""
@@ -182,7 +172,7 @@ class Px4Stub:
 
     def on_setpoint(self, t_s: float, target: OffboardTarget) -> None:
         """Process an offboard setpoint that arrived at world time `t_s`."""
-        self._setpoint_at_s = t_s
+        self.setpoint_at_s = t_s
         self._setpoint_kind = target.kind if isinstance(target, PositionTarget) else OffboardKind.ATTITUDE
         self._queue.append((t_s + self._setpoint_delay_s, target))
 
@@ -212,7 +202,6 @@ class Px4Stub:
         return result
 
     def _refusal(self, command: int, params: Command7) -> str | None:
-        """Return the text with which a fault refuses a command, or None."""
         if self.refuses_offboard and command == Command.DO_SET_MODE and params[1] == NavState.OFFBOARD.value[0]:
             return "Switching to Offboard is currently not available"
         if self.refuses_arming and command == Command.COMPONENT_ARM_DISARM and params[0] == 1.0:
@@ -224,12 +213,12 @@ class Px4Stub:
         self.booted_at_s = self.t_s + for_s
         self.commander, self.navigator = Commander(self.params), Navigator(self.params)
         self.land, self._estimator = LandDetector(self.params), Estimator()
-        self.estimate = self.origin = self.home_ned_m = self._offboard = self._setpoint_at_s = self._flying = None
+        self.estimate = self.origin = self.home_ned_m = self._offboard = self.setpoint_at_s = self._flying = None
         self.target, self.rotors = AttitudeTarget((1.0, 0.0, 0.0, 0.0), 0.0), self._stopped
         self._queue.clear()
         self._cascade.reset()
         self._next_commander_s = self._position_at_s = -math.inf
-        self._climb_rate_controlled = False
+        self.position_controlled = False
 
     def start_over(self) -> None:
         """Return to the state before the first step: world time starts over. Parameters and the global origin stay."""
@@ -242,9 +231,7 @@ class Px4Stub:
         self.clock_ahead_s = self.since_sample_s = 0.0
 
     def pilot_sets_mode(self, state: NavState) -> None:
-        """Change the mode as the mode switch of a pilot's radio does; set the origin and the home position first if they are not
-        known.
-        """
+        """Change the mode as a pilot's mode switch does; set origin and home position first if they are not known."""
         estimate = self.estimate
         if estimate is None:
             return
@@ -269,7 +256,7 @@ class Px4Stub:
             commander.armed,
             estimate,
             self.target.thrust,
-            self._climb_rate_controlled,
+            self.position_controlled,
             self.navigator.descend_m_s,
         )
         if self.home_ned_m is None and self.origin is not None and estimate.position_valid:
@@ -295,16 +282,16 @@ class Px4Stub:
     def _choose_target(self, t_s: float, estimate: Estimate) -> None:
         offboard = self._offboard if self.commander.nav_state is _OFFBOARD else None
         if isinstance(offboard, AttitudeTarget):
-            self._climb_rate_controlled = False
+            self.position_controlled = False
             self.navigator.settle(self.land.landed)
             self.target = offboard
             return
         if isinstance(offboard, RateTarget):
-            self._climb_rate_controlled = False
+            self.position_controlled = False
             self.navigator.settle(self.land.landed)
             self.target = self._attitude_for_rates(estimate, offboard)
             return
-        self._climb_rate_controlled = True
+        self.position_controlled = True
         since_s = t_s - self._position_at_s
         if since_s < _POSITION_PERIOD_S - _TIME_EPSILON_S:
             return
@@ -355,7 +342,7 @@ class Px4Stub:
             home_set=origin_set and self.home_ned_m is not None,
             landed=self.land.landed,
             maybe_landed=self.land.maybe_landed,
-            setpoint_age_s=None if self._setpoint_at_s is None or self.refuses_offboard else t_s - self._setpoint_at_s,
+            setpoint_age_s=None if self.setpoint_at_s is None or self.refuses_offboard else t_s - self.setpoint_at_s,
             setpoint_kind=self._setpoint_kind,
             killed=self.kill_switch,
         )

@@ -26,7 +26,6 @@ from sitl.world.machine import Machine
 LINK_DELAY_S = 0.002
 """Time from sending a setpoint to its arrival at PX4 where the link itself takes no simulated time."""
 STUB_VERSION = "1.16"
-"""PX4 version that the stub imitates."""
 
 
 class Observation(NamedTuple):
@@ -119,7 +118,6 @@ def stub_of(config: WorldConfig, airframe: Airframe, link_delay_s: float = 0.0) 
 
     Args:
         config: configuration of the world; `setpoint_delay_s`, `thr_mdl_fac`, `px4_params` and the biases of `imu` are used.
-        airframe: airframe of the vehicle file, for the layout of the rotors.
         link_delay_s: added to the setpoint delay, for a loop without a real link.
     """
     params = Params()

@@ -76,9 +76,7 @@ class Cascade:
         return self.mixer.mix(torque, target.thrust)
 
     def _rate_setpoint(self, q: Quat, target: AttitudeTarget) -> Vec3:
-        """Return the rate setpoint in rad/s: quaternion P control with reduced yaw priority (Brescianini et al., as in
-        mc_att_control).
-        """
+        """Return the rate setpoint, rad/s: quaternion P control with reduced yaw priority (Brescianini et al., mc_att_control)."""
         w, x, y, z = q
         wd, xd, yd, zd = target.attitude_ned_frd
         # z axes of both attitudes and the shortest rotation between them.

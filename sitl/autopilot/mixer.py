@@ -17,9 +17,6 @@ class Mixer:
 
     The matrix is PX4's, but with a root mean square of 1 instead of 0.71 for roll and pitch: the stub's rate gains refer to a rotor
     that receives the whole command.
-
-    Args:
-        rotors: layout of the rotors.
     """
 
     def __init__(self, rotors: RotorLayout) -> None:

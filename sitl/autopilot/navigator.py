@@ -110,13 +110,7 @@ class Navigator:
         """Run one period of the position loop.
 
         Args:
-            t_s: world time.
-            dt_s: time since the last period.
-            estimate: state of the vehicle.
-            home_ned_m: home position, or None.
             offboard: position setpoint in OFFBOARD, or None.
-            armed_s: time since arming.
-            landed: whether the land detector reports landed.
             touching: whether the land detector reports ground contact.
         """
         self.target = target = self._mode_target(dt_s, estimate, home_ned_m, offboard)
@@ -183,9 +177,7 @@ class Navigator:
         return (vz is not None and vz < 0.0) or (az is not None and az < 0.0)
 
     def _climb_limit(self, t_s: float) -> float | None:
-        """Return the upward speed limit in m/s, or None for no additional limit. During the take-off ramp, the limit rises from the
-        value that commands zero thrust (Takeoff::updateRamp).
-        """
+        """Return the upward speed limit, m/s, or None; in the take-off ramp it rises from that of zero thrust (updateRamp)."""
         real = self._params.real
         speed = real("MPC_TKO_SPEED")
         if self.phase is Phase.RAMPUP:

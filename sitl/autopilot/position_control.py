@@ -52,9 +52,7 @@ class PositionControl:
     def step(
         self, dt_s: float, estimate: Estimate, target: PositionTarget, climb_limit_m_s: float | None = None
     ) -> AttitudeTarget:
-        """Run one control period and return the attitude setpoint. `climb_limit_m_s` lowers the upward speed limit during the take-off
-        ramp; if it is negative, only descent is possible.
-        """
+        """Run one control period; return the attitude setpoint. `climb_limit_m_s` limits the upward speed, negative: only descent."""
         if self._revision != self._params.revision:
             self._gains = self._read()
         gains = self._gains

@@ -212,9 +212,7 @@ class Receiver:
         self._vision((m.x, m.y, m.z), quat_from_euler_zyx(m.roll, m.pitch, m.yaw))
 
     def _odometry(self, _link: Reply, message: Message) -> None:
-        """Accept ODOMETRY only if it is external vision; PX4 silently ignores frame MOCAP_NED and the estimator types unset and
-        naive.
-        """
+        """Accept ODOMETRY only if it is external vision; PX4 silently ignores frame MOCAP_NED and estimators unset and naive."""
         m = message
         if m.estimator_type in _FUSED_ESTIMATORS and m.frame_id in _FUSED_FRAMES:
             self._vision((m.x, m.y, m.z), (m.q[0], m.q[1], m.q[2], m.q[3]))

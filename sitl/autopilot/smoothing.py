@@ -20,7 +20,6 @@ class Smoothing:
     """Position, velocity and acceleration of the trajectory in the horizontal plane, local NED.
 
     Args:
-        position_ned_m: horizontal position at the start.
         velocity_ned_m_s: horizontal velocity at the start; the initial acceleration is zero.
     """
 

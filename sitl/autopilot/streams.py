@@ -110,9 +110,7 @@ class Schedule:
         return True
 
     def set_interval_us(self, message_id: int, interval_us: float) -> bool:
-        """Handle MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops the stream, 0 sets the default rate. Return False if there is no such
-        stream.
-        """
+        """Handle MAV_CMD_SET_MESSAGE_INTERVAL: -1 stops the stream, 0 is the default rate; return False without such a stream."""
         if message_id not in STREAMS or not math.isfinite(interval_us):
             return False
         if interval_us == 0:

@@ -59,9 +59,7 @@ def system_status(stub: Px4Stub) -> int:
 
 
 def sys_status(stub: Px4Stub) -> Message:
-    """Return SYS_STATUS. As measured on PX4, PREARM_CHECK is never healthy with SYS_HAS_MAG = 0, and position sources are not
-    reported.
-    """
+    """Return SYS_STATUS, as measured on PX4: PREARM_CHECK never healthy with SYS_HAS_MAG = 0, no position sources."""
     present = (
         mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
         | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
@@ -130,9 +128,7 @@ def attitude_quaternion(stub: Px4Stub) -> Message | None:
 
 
 def local_position_ned(stub: Px4Stub) -> Message | None:
-    """Return LOCAL_POSITION_NED. PX4 sends it even if the position is invalid: (0, 0, 0) before the first vision pose, dead
-    reckoning after vision is lost.
-    """
+    """Return LOCAL_POSITION_NED, which PX4 sends even if invalid: (0, 0, 0) before vision, dead reckoning after its loss."""
     estimate = _attitude(stub)
     if estimate is None:
         return None

@@ -44,9 +44,7 @@ class Estimate(NamedTuple):
 
 
 class Fusion(NamedTuple):
-    """Innovation test ratios of vision as in ESTIMATOR_STATUS (square roots of the filtered test ratios), and accuracies (one
-    sigma).
-    """
+    """Innovation test ratios of vision as in ESTIMATOR_STATUS (roots of filtered test ratios), and accuracies (one sigma)."""
 
     horizontal_ratio: float
     """Test ratio of the horizontal position; NaN while vision is not fused."""

@@ -53,7 +53,6 @@ def _send(message: Data) -> None:
 
 
 def _read_until_parent_ends(lines: SimpleQueue[bytes]) -> None:
-    """Queue the lines of standard input; end this process and its workers when it closes."""
     unfinished = b""
     while data := os.read(sys.stdin.fileno(), 1 << 16):
         *whole, unfinished = (unfinished + data).split(b"\n")

@@ -46,7 +46,6 @@ def with_world(config: SitlConfig, changes: Data) -> SitlConfig:
     """Return the configuration with some keys of its world changed; a different seed draws a different laboratory.
 
     Args:
-        config: configuration of a flight.
         changes: new values (plain data) by key of the world. A key given here is not drawn at random.
     """
     laboratory = config.laboratory.without(list(changes))
@@ -61,9 +60,7 @@ def laboratory_of(config: SitlConfig) -> Data:
 
 
 def fly_to_end(config: SitlConfig, limit_s: float = 90.0, until_mission_s: float = math.inf) -> Flown:
-    """Fly the mission, at most until world time `limit_s` and until `until_mission_s` on its own clock. An exception ends only this
-    flight; it is returned in `Flown.error`.
-    """
+    """Fly at most until world time `limit_s` and mission time `until_mission_s`; an exception is returned in `Flown.error`."""
     gc.collect()  # what is left of the flight before: the collector itself comes to the oldest objects after hundreds of flights only
     try:
         fast = FastFlight(config)
@@ -87,8 +84,6 @@ def row_of(
     and after the catch is the world's truth, in the log as well; only `catch_t_s` is the companion's own event.
 
     Args:
-        config: configuration of the flight.
-        result: result of the flight.
         caught_t_s: world time of the true catch; None if the payload was not caught.
         error: the exception that ended the flight, if any.
         cut: whether the flight was ended in the air on purpose: it is completed if the supervisor did no more than warn.
@@ -123,9 +118,7 @@ def row_of(
 
 
 def torque_activity_nm(log: FlightLog, mask: metrics.Mask) -> float | None:
-    """Return the RMS of the change in commanded joint torque (norm over all joints, N m) from one tick to the next, over the ticks
-    that `mask` selects.
-    """
+    """Return the RMS change of commanded joint torque (norm over the joints, N m) from tick to tick, over the ticks of `mask`."""
     torque = log.column(lambda i, o, s: o.arm_torque_nm, log.joint_count)
     return metrics.rms_norm(np.diff(torque, axis=0)[mask[1:] & mask[:-1]])
 
@@ -157,9 +150,7 @@ def _without_catch_events(result: FastResult) -> FastResult:
 
 
 def _with_catch(result: FastResult, caught_t_s: float | None) -> tuple[Outputs, ...]:
-    """Return the outputs with a catch event. If the core did not detect the catch, the event is added at the true catch, so that the
-    errors before and after it are not mixed.
-    """
+    """Return the outputs with a catch event: at the true catch if the core missed it, so that errors before and after stay apart."""
     outputs = list(result.outputs)
     seen = any(event.id == "catch" for output in outputs for event in output.events)
     if caught_t_s is not None and not seen:

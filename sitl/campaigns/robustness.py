@@ -56,11 +56,6 @@ class Throw:
 def throws(mission: Mission, vehicle: Vehicle, flight_s: float = 0.45) -> list[Throw]:
     """Return the catch points along the first pass in the +x direction, in flight order.
 
-    Args:
-        mission: the mission.
-        vehicle: the vehicle.
-        flight_s: time from the throw to the arrival.
-
     Raises:
         CampaignError: the mission has no such pass.
     """
@@ -102,8 +97,6 @@ def draw(seed: int, number: int, places: list[Throw]) -> Data:
     """Draw the payload, the throw, the catch point and the seed for the rest of the world; return these keys of the world.
 
     Args:
-        seed: seed of the campaign.
-        number: number of the draw.
         places: catch points from `throws`.
     """
     rng = np.random.default_rng([seed, number])

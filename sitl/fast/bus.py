@@ -30,7 +30,6 @@ def scales_of(vehicle: Vehicle, servos: Sequence[ServoModel]) -> tuple[JointScal
 
     Args:
         vehicle: vehicle file with the assumed ids, baud rate and torques.
-        servos: all servos that are connected to the bus.
 
     Returns:
         None unless exactly one servo of the right model answers at each joint's id and baud rate in the vehicle file and its current
@@ -65,8 +64,6 @@ class FastBus:
         drives: motors of the servos; they are set to current mode.
         scales: scale of each joint; None if the bus set-up failed, in which case the arm never answers. It does not answer either if
             there are no joints.
-        watchdog_s: timeout of the servos' bus watchdog.
-        faults: faults of the world; None if it has none.
     """
 
     def __init__(
@@ -91,9 +88,7 @@ class FastBus:
             drive.start_watchdog(watchdog_s)
 
     def read(self, t_s: float) -> ArmState | None:
-        """Return the joint state of this tick. If the read fails, return the last state with one more read failure; None if the bus
-        set-up failed.
-        """
+        """Return the joint state of this tick, or the last one with one more read failure; None if the bus set-up failed."""
         if self._read is not None or (self._arm is not None and self._delay_s):
             self._next_read_s = t_s + TICK_PERIOD_S - JOINT_LEAD_MAX_S
         elif self._arm is None or self._faults is None or not self._read_fails(self._faults):

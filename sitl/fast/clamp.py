@@ -15,7 +15,6 @@ class FastClamp:
     """The companion's reads and writes of the clamp's servo.
 
     Args:
-        jaws: angles and current.
         drive: the servo's motor; it is set to current-based position control.
     """
 

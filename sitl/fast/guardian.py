@@ -109,7 +109,6 @@ class FastGuardian:
 
     Args:
         vehicle: vehicle file; provides the timeout and the height of the vehicle on the floor.
-        px4: the stub to which the guardian connects.
     """
 
     def __init__(self, vehicle: Vehicle, px4: Px4Stub) -> None:
@@ -133,7 +132,6 @@ class FastGuardian:
         """Return whether the guardian now takes over from the flight process, and record the event; call this method in every tick.
 
         Args:
-            t_s: world time.
             heard: whether a heartbeat arrived in this tick.
             dead: whether the flight process has ended.
         """

@@ -26,9 +26,7 @@ class FastLink:
 
     Args:
         faults: faults of the world; None if there are none, and messages then arrive at once.
-        scene: simulated physics, which provides the time.
         px4: the stub; while it boots, the link is dead.
-        tick_s: period of the control tick.
     """
 
     def __init__(self, faults: Faults | None, scene: Scene, px4: Px4Stub, tick_s: float) -> None:
@@ -84,9 +82,7 @@ class FastLink:
     def receive(
         self, state: VehicleState | None, status: AutopilotStatus | None
     ) -> tuple[VehicleState | None, AutopilotStatus | None]:
-        """Return what the core receives in this tick: a delayed state if the link is slow, the last received state if the link is
-        lost.
-        """
+        """Return what the core receives in this tick: a delayed state on a slow link, the last received one on a lost link."""
         if self._faults is None:
             return state, status
         received = self._received

@@ -64,7 +64,6 @@ class FastFlight:
         commands: the operator's commands, by the time on the flight clock at which each is given.
         make_law: makes the control law in place of the configured one.
         scene: the scene of which this is machine `number`; None for a scene of its own.
-        number: number of the machine.
     """
 
     def __init__(
@@ -134,9 +133,7 @@ class FastFlight:
     def run(
         self, limit_s: float = 90.0, until_mission_s: float = math.inf, until: Callable[[Outputs], bool] | None = None
     ) -> FastResult:
-        """Fly until the mission ends, the vehicle crashes, world time reaches `limit_s`, the mission's clock `until_mission_s`, or
-        `until` returns True for a tick's outputs.
-        """
+        """Fly until the mission ends, a crash, world time `limit_s`, mission time `until_mission_s`, or `until` is True of a tick."""
         result = FastResult()
         with garbage_collection_paused():
             for _ in self.ticks(result, limit_s, until_mission_s, until):
@@ -168,9 +165,7 @@ class FastFlight:
         until_mission_s: float = math.inf,
         until: Callable[[Outputs], bool] | None = None,
     ) -> None:
-        """Begin the flight whose record is `result`; the arguments are those of `run`. From then on, call `Plant.act`, a step of the
-        scene and `after_step`, until the flight is over.
-        """
+        """Begin the flight recorded in `result`, with the arguments of `run`; then call `Plant.act`, the scene, `after_step`."""
         result.layout = self.plant.machine.layout
         self._result, self._limit_s, self._until_mission_s, self._until = result, limit_s, until_mission_s, until
 
@@ -234,7 +229,6 @@ class FastFlight:
         return outputs
 
     def _receive(self) -> None:
-        """Let motion capture and PX4 send what is due after a step."""
         plant = self.plant
         if plant.faults is not None:
             self._bus.step(plant.scene.t_s)
@@ -263,7 +257,6 @@ class FastFlight:
         result.miss_m = scene.payload.miss_m
 
     def _sample_force(self) -> None:
-        """Take a sample of the force sensor, which the next tick reads."""
         force_n, torque_nm = self.plant.force_torque()
         if self.plant.fault("force_loss") is not None:
             return
@@ -275,7 +268,6 @@ class FastFlight:
         return self.px4.armed and not self.plant.machine.crashed and self.plant.scene.t_s < self._settles_until_s
 
     def _settle(self) -> None:
-        """Let PX4 finish the landing of a flight that has ended in the air."""
         if self._external:
             self._poses_for_guardian()
         self._record_landing()
@@ -283,15 +275,12 @@ class FastFlight:
             self._over()
 
     def _record_landing(self) -> None:
-        """Record the state of the world, if that is due."""
         if self.plant.scene.t_s >= self._lands_s + TICK_PERIOD_S - 1e-9:
             self._lands_s += TICK_PERIOD_S
             self._result.after.append(self.plant.machine.snapshot())
 
     def _flight_process_stalled(self, guardian: FastGuardian) -> bool:
-        """Return whether a fault stops the control ticks of the flight process. If only its event loop is stalled, also do what its bus
-        thread still does.
-        """
+        """Return whether a fault stops the flight process's ticks; if only its event loop stalls, do what its bus thread does."""
         active, t_s = self.faults.active, self.plant.scene.t_s
         guardian.alive = "kill_guardian" not in active
         if "stall_loop" in active:
@@ -368,9 +357,7 @@ class FastFlight:
         )
 
     def announced(self, outputs: Outputs | None) -> TeamState | None:
-        """Return what the vehicle tells its partner after this step: the core in a tick, the guardian while it lands the vehicle; None
-        between ticks and while both are silent.
-        """
+        """Return what the vehicle tells its partner after this step: the core, or a landing guardian; None if there is nothing."""
         if outputs is not None:
             return outputs.team
         guardian, pose = self._guardian, self._mocap.newest

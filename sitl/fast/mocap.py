@@ -14,12 +14,7 @@ from sitl.mocap import MocapFrame
 
 
 class FastMocap:
-    """The newest pose, markers and bar that the companion has received.
-
-    Args:
-        device: motion capture in the vehicle file.
-        faults: faults of the world; None if there are none.
-    """
+    """The newest pose, markers and bar that the companion has received."""
 
     def __init__(self, device: MocapDevice, faults: Faults | None) -> None:
         self._faults, self._external = faults, device.external

@@ -33,7 +33,6 @@ class FastTeam:
     """One flight of two vehicles.
 
     Args:
-        config: configuration of both members.
         commands: the operator's commands to each member, by time.
         link_delay_s: delay of what a member says at a time; infinite for what is lost.
     """

@@ -43,7 +43,6 @@ class FastTelemetry:
     """The newest data of each stream that the companion reads.
 
     Args:
-        px4: the stub.
         battery: returns the measurement of the power module.
         external: whether another program feeds PX4 with poses; its estimator is then watched at a higher rate.
     """

@@ -55,11 +55,6 @@ class Faults:
 
     Args:
         config: configuration of the world; every fault has a time (`with_fault_times`).
-        scene: simulated physics.
-        machine: the machine of that scene on which the faults act.
-        px4: the autopilot.
-        drives: motors of the servos.
-        tether: the vehicle's tether, or None if it has none.
         servos: control tables of the servos; empty in the fast closed loop.
     """
 
@@ -102,12 +97,7 @@ class Faults:
     # -- when ------------------------------------------------------------------------------------------------------
 
     def step(self, t_s: float, armed_t_s: float | None) -> None:
-        """Start and end faults that are due; call it before every step of the physics.
-
-        Args:
-            t_s: world time.
-            armed_t_s: world time of arming, or None.
-        """
+        """Start and end faults that are due; call it before every step of the physics."""
         self._now_s = t_s
         contact, payload = self._machine.contact, self._scene.payload
         origins = {
@@ -243,7 +233,6 @@ class Faults:
         self._machine.wind_m_s = (wx + speed_m_s * x / away_m, wy + speed_m_s * y / away_m, wz)
 
     def _shut_down_servo(self, index: int, error: int) -> None:
-        """Shut a servo down as its own protection would."""
         if self._servos and error == OVERLOAD:
             self._servos[index].trip_overload()
         elif not self._servos:

@@ -36,7 +36,6 @@ def environment(kinds: set[str], stall_s: float | None = None) -> dict[str, str]
     """Return the environment variables that the flight process needs for these kinds of faults.
 
     Args:
-        kinds: fault kinds.
         stall_s: duration of the event loop's stall; None if it never ends.
     """
     if not kinds & {"hold_gil", "stall_loop"}:
@@ -90,15 +89,12 @@ def _config(pid: int) -> str | None:
 
 
 class ProcessFaults:
-    """Injects one fault into the flight process, then records PX4's inputs and the vehicle's motion; injects each fault of the recorder
-    and the guardian once.
-    """
+    """Injects one fault into the flight process, records PX4's inputs and the motion; also faults of recorder and guardian."""
 
     def __init__(self) -> None:
         self.pid: int | None = None
         """Pid of the flight process, which the launcher sends; None until then."""
         self.kind: FlightFaultKind | None = None
-        """Kind of the fault that was injected, or None."""
         self._t_s = 0.0
         self._start_m: Vec3 = (0.0, 0.0, 0.0)
         self._position_m: Vec3 = (0.0, 0.0, 0.0)
@@ -122,9 +118,6 @@ class ProcessFaults:
         """Signal the flight process; return False if a fault was already injected or the pid is not known.
 
         Args:
-            kind: kind of the fault.
-            t_s: world time.
-            position_m: position of the vehicle, world frame.
             vision_count: vision poses that PX4 received so far, or None if that is not observable.
         """
         if self.kind is not None or self.pid is None:
@@ -138,12 +131,7 @@ class ProcessFaults:
         return True
 
     def inject_others(self, active: Collection[FaultKind], t_s: float) -> None:
-        """Inject each due fault of the recorder and the guardian once, and resume the flight process when its SIGSTOP fault ends.
-
-        Args:
-            active: kinds of the active faults.
-            t_s: world time.
-        """
+        """Inject each due fault of the recorder and the guardian once, and resume the flight process when its SIGSTOP fault ends."""
         due = [kind for kind in OTHER_PROCESS_FAULTS if kind in active and kind not in self._injected]
         if due and self.pid is not None and t_s >= self._inject_due_s:
             self._inject_due_s = t_s + INJECT_RETRY_S
@@ -197,9 +185,7 @@ class ProcessFaults:
         self._worst_tilt_rad = max(self._worst_tilt_rad, tilt_rad(attitude_wxyz))
 
     def report(self) -> dict[str, Any] | None:
-        """Return the report on the fault, or None if no fault was injected. Times are in s after the fault; None for an event that
-        never happened.
-        """
+        """Return the report on the fault, or None if there was none; times in s after it, None for what never happened."""
         if self.kind is None:
             return None
 

@@ -151,7 +151,6 @@ class FlightEnvironment(gymnasium.Env[Vector, Vector]):
         return self._law
 
     def _decide(self, observation: Sequence[float]) -> Sequence[float]:
-        """Keep the observation for the agent, whose action follows before the next tick."""
         self._observation, self._decides = np.array(observation, np.float32), True
         return (0.0,) * len(self.card.actions)
 

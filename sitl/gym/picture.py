@@ -12,9 +12,7 @@ _BASE_SIZE_M = (0.22, 0.22, 0.04)
 
 
 def picture(renderer: mujoco.Renderer, model: mujoco.MjModel, data: mujoco.MjData) -> Any:
-    """Return a picture (height, width, 3) that follows the first body. Bodies have no shapes in the model: they are drawn here, a box
-    for the vehicle and a line from each body to the next.
-    """
+    """Return a picture (height, width, 3) that follows the first body: a box for it, and lines to the bodies after it."""
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.distance, camera.azimuth, camera.elevation = data.xpos[1], 2.5, 120.0, -15.0
     renderer.update_scene(data, camera)

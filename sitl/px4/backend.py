@@ -78,8 +78,6 @@ class RealPx4(AutopilotBackend):
     """One PX4 for one flight.
 
     Args:
-        airframe: airframe of the vehicle file.
-        config: configuration of the world.
         folder: folder for PX4's parameters, logs and output.
         progress: called with each progress message, one line for the user.
 
@@ -142,9 +140,7 @@ class RealPx4(AutopilotBackend):
 
     @contextlib.asynccontextmanager
     async def wires(self) -> AsyncIterator[str]:
-        """Open the simulator and control links and start PX4 if an installation was found; yield the companion's address. Stop PX4
-        on exit.
-        """
+        """Open the simulator and control links, start PX4 if one is installed, and yield the companion's address; stop it on exit."""
         async with contextlib.AsyncExitStack() as stack:
             stack.callback(self._instance.close)
             await stack.enter_async_context(self._link)
@@ -190,11 +186,7 @@ class RealPx4(AutopilotBackend):
         self._flies = True
 
     async def _boot(self, deadline_s: float) -> None:
-        """Wait until PX4 answers sensor samples: up to `deadline_s` for its connection, then up to `BOOT_DEADLINE_S` for its boot.
-
-        Raises:
-            Px4Error: PX4 has ended, or a deadline has passed.
-        """
+        """Wait until PX4 answers samples: `deadline_s` to connect, then `BOOT_DEADLINE_S` to boot; raises Px4Error."""
         found, end_s = "no connection", time.monotonic() + deadline_s
         while not await self._link.await_lockstep(0.2):
             if self._process is not None and not self._process.running:
@@ -282,9 +274,7 @@ class RealPx4(AutopilotBackend):
         return self._link.rotors
 
     def pump(self, t_s: float, battery: Battery) -> None:
-        """Send the battery's state if its effect is on; otherwise PX4 simulates a battery itself. PX4 streams its telemetry on its
-        own.
-        """
+        """Send the battery's state if its effect is on; otherwise PX4 simulates one. It streams its telemetry by itself."""
         if self._config.battery.on and t_s >= self._next_battery_s:
             self._next_battery_s = t_s + BATTERY_PERIOD_S
             self._control.send_battery(battery)

@@ -52,7 +52,6 @@ class ControlLink(UdpEndpoint):
     """The world's control link to PX4; an async context manager on the socket of the instance.
 
     Args:
-        instance: the PX4 with which the link communicates.
         battery_cells: number of cells of the battery whose state is sent, 1 to 10.
     """
 
@@ -218,9 +217,7 @@ class ControlLink(UdpEndpoint):
         self._command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0.0, _FORCE_DISARM)
 
     def send_battery(self, battery: Battery) -> None:
-        """Send BATTERY_STATUS with PX4's system id, so that PX4 uses it in place of its power module
-        (MavlinkReceiver::handle_message_battery_status).
-        """
+        """Send BATTERY_STATUS with PX4's system id, which PX4 uses in place of its power module (handle_message_battery_status)."""
         cells = [round(battery.voltage_v / self._cells * 1e3)] * self._cells + [0xFFFF] * (10 - self._cells)
         message = mavlink.MAVLink_battery_status_message(
             0, mavlink.MAV_BATTERY_FUNCTION_ALL, mavlink.MAV_BATTERY_TYPE_LIPO, 2500, cells, round(battery.current_a * 1e2),
@@ -252,9 +249,7 @@ class ControlLink(UdpEndpoint):
         self._send(mavlink.MAVLink_command_long_message(self._system, _AUTOPILOT, command, 0, *numbers))
 
     async def _ask(self, send: Callable[[], None], answer: Callable[[Any], Any], deadline_s: float) -> Any:
-        """Call `send` every ASK_AGAIN_S until `answer` returns a value for a received message; return that value, or None at the
-        deadline.
-        """
+        """Call `send` every ASK_AGAIN_S until `answer` returns a value for a message; return it, or None at the deadline."""
         answered: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
 
         def handle(message: Any) -> None:

@@ -105,7 +105,6 @@ class SimulatorLink:
 
     Args:
         listener: listening socket to which PX4 connects, 127.0.0.1:4560 plus the instance number; closed with the link.
-        sensors: builds the sensor messages.
         rotors: number of rotors; HIL_ACTUATOR_CONTROLS carries up to 16.
     """
 

@@ -51,8 +51,6 @@ def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) ->
     """Return every parameter that is set on a real PX4 before it flies, by name.
 
     Args:
-        airframe: airframe of the vehicle file, for the rotor geometry.
-        config: configuration of the world.
         hover_command: true normalised hover thrust.
     """
     gains = {name: PX4_DEFAULTS[name] for name in _GAINS}

@@ -195,8 +195,6 @@ class Px4Process:
     """A running PX4.
 
     Args:
-        installation: the program to start.
-        instance: claimed instance.
         folder: PX4's working folder, created if it does not exist; PX4 keeps its parameters there between starts.
         settings: parameters to set before PX4's modules start (PX4_PARAM_* in its start script).
 
@@ -273,9 +271,7 @@ class Px4Process:
 
 
 def _before_exec() -> None:
-    """Prepare the child process: it ends with its parent, because PX4 would otherwise wait forever for a simulator, and it gives up
-    real-time priority.
-    """
+    """Prepare the child process: it ends with its parent, as PX4 waits forever for a simulator, without real-time priority."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 

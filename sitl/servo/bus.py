@@ -39,24 +39,14 @@ class ServoLine:
 
     def __init__(self, servos: Iterable[ServoModel]) -> None:
         self.servos = tuple(servos)
-        self._parser = PacketParser()
+        self.parser = PacketParser()
         self._listening: list[ServoModel] = []
         self._delay_s = 0.0
-
-    @property
-    def packet_pending(self) -> bool:
-        """Whether a packet has begun and is incomplete."""
-        return self._parser.pending
-
-    def drop_partial(self) -> None:
-        """Drop an incomplete packet; call this method if the line goes idle in the middle of a packet."""
-        self._parser.drop_partial()
 
     def feed(self, data: bytes, baud_bps: int | None = None) -> bytes:
         """Process bytes from the master and return the servos' answer; never raise an exception.
 
         Args:
-            data: any bytes.
             baud_bps: baud rate of the bytes; if None, every servo receives them.
         """
         return self.exchange(data, baud_bps)[0]
@@ -64,7 +54,7 @@ class ServoLine:
     def exchange(self, data: bytes, baud_bps: int | None = None) -> tuple[bytes, float]:
         """Process bytes like `feed`, and also return the sum of the servos' return delay times in s."""
         self._delay_s = 0.0
-        packets = self._parser.feed(data)
+        packets = self.parser.feed(data)
         if not packets:
             return b"", 0.0
         self._listening = [s for s in self.servos if not s.silent and baud_bps in (None, s.baud_bps)]
@@ -78,7 +68,7 @@ class ServoLine:
         if packet.instruction == Instruction.STATUS:
             return b""
         for servo in self._listening:
-            servo.heard_instruction()
+            servo.drive.heard_instruction()
         handler = {
             Instruction.SYNC_READ: self._sync_read,
             Instruction.SYNC_WRITE: self._sync_write,
@@ -242,7 +232,6 @@ class ServoBus:
     """The servos behind a pty, served by the running event loop.
 
     Args:
-        servos: the servos on the wire.
         page: page of simulated time, on which the bus writes how much it has answered; None in real time. In simulated time the
             transmission takes no time.
         wire_time: delay every answer by the transmission time of request and answer at the line's baud rate and by the return
@@ -286,8 +275,8 @@ class ServoBus:
     def _on_bytes(self, data: bytes) -> None:
         loop = asyncio.get_running_loop()
         now_s = loop.time()
-        if self._page is None and self.line.packet_pending and now_s - self._last_byte_s > _PARTIAL_TIMEOUT_S:
-            self.line.drop_partial()
+        if self._page is None and self.line.parser.pending and now_s - self._last_byte_s > _PARTIAL_TIMEOUT_S:
+            self.line.parser.drop_partial()
         self._last_byte_s = now_s
         # No servo supports a speed without a name in termios.
         baud_bps = _BAUD_OF_SPEED.get(self._pty.speed(), 0)
@@ -324,9 +313,7 @@ class ServoBus:
         self._send(noise)
 
     def answer_to(self, data: bytes, baud_bps: int) -> tuple[bytes, float]:
-        """Return the servos' answer to a request sent at a given baud rate, and their total return delay in s; noise may corrupt
-        the request.
-        """
+        """Return the servos' answer to a request sent at a baud rate, and their return delay, s; noise may corrupt the request."""
         if self.damaged():
             middle = len(data) // 2
             data = data[:middle] + bytes((data[middle] ^ 0x5A,)) + data[middle + 1 :]

@@ -126,7 +126,6 @@ class ServoDrive:
         """Set the goal current (register 102), in the servo's own direction; it takes effect `goal_delay_s` later.
 
         Args:
-            counts: goal current.
             at_once: whether the goal takes effect at once and pending goals are dropped.
         """
         if at_once or self.goal_delay_s == 0.0:

@@ -54,7 +54,6 @@ def servo_of(joint: Joint, device: ArmDevice, settings: Servo) -> ServoModel:
     Args:
         joint: joint of the vehicle file; gives the servo's model, and its id unless `settings` does.
         device: arm device of the vehicle file; gives the baud rate unless `settings` does.
-        settings: actual settings of the simulated servo.
     """
     servo = ServoModel(
         joint.servo_id if settings.id is None else settings.id,

@@ -16,7 +16,6 @@ class Kind:
     number: int
     """Model number (register 0)."""
     firmware: int
-    """Firmware version as delivered."""
     amp_per_count: float
     """Unit of registers 38, 102 and 126."""
     current_counts: int

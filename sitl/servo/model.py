@@ -51,7 +51,6 @@ class ServoModel:
     Args:
         servo_id: servo id (register 7).
         baud_bps: baud rate (register 8); the servo receives only packets sent at this rate.
-        kind: name of the model.
         firmware: firmware version (register 6); None for that of the model as delivered.
         model: model number (register 0); None for that of the model.
         shaft_angle_rad: shaft angle before the first `update`.
@@ -97,7 +96,8 @@ class ServoModel:
         self.lights = 0
         """Number of times that the LED has been switched on."""
         self._shutdown = False
-        self._silent = False
+        self.silent = False
+        """Whether the data wire is broken."""
         self._power_on()
 
     # --- side of the world -------------------------------------------------------------------------------------------
@@ -131,10 +131,8 @@ class ServoModel:
         self.drive.goal_delay_s = delay_s
 
     def fail_silent(self, silent: bool) -> None:
-        """Break or restore the data wire. While it is broken, the servo neither receives nor answers, and its motor runs on until its
-        watchdog trips.
-        """
-        self._silent = silent
+        """Break or restore the data wire: a servo without it neither receives nor answers, and runs on until its watchdog trips."""
+        self.silent = silent
 
     def trip_overload(self) -> None:
         """Raise the overload error, as the servo does after holding too large a load."""
@@ -193,18 +191,9 @@ class ServoModel:
         return self._memory[68]
 
     @property
-    def silent(self) -> bool:
-        """Whether the data wire is broken."""
-        return self._silent
-
-    @property
     def alert(self) -> int:
         """Alert bit (0x80) of every status packet's error byte if register 70 reports an error, else 0."""
         return ALERT if self._memory[70] else 0
-
-    def heard_instruction(self) -> None:
-        """Restart the watchdog's timer, because a valid instruction packet for any servo was on the bus."""
-        self.drive.heard_instruction()
 
     def read(self, address: int, length: int) -> bytes:
         """Return bytes of the control table.
@@ -260,7 +249,6 @@ class ServoModel:
         return address
 
     def _checked(self, address: int, data: bytes) -> list[tuple[Register, int]]:
-        """Split `data` into writes of single registers and check that each of them is allowed."""
         if not data:
             raise ServoRefusal(StatusError.DATA_LENGTH)
         targets = [self._resolve(address + i, StatusError.ACCESS) for i in range(len(data))]
@@ -361,7 +349,6 @@ class ServoModel:
             drive.start_watchdog(watchdog * WATCHDOG_UNIT_S if watchdog else None)
 
     def _show_present(self) -> None:
-        """Copy the drive's present values into the table."""
         memory = self._memory
         # One assignment, so that a read never mixes values of two moments.
         current, velocity, position = self.drive.present()

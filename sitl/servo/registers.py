@@ -174,4 +174,3 @@ REGISTER_AT: dict[int, Register] = {
 INDIRECT_POINTER: dict[int, int] = {
     data + i: first + 2 * i for first, data, count in INDIRECT_BLOCKS for i in range(count)
 }
-"""Indirect address register of each byte of indirect data."""

@@ -18,7 +18,6 @@ class ArmHandling:
 
     Args:
         arm: arm of the vehicle file; its joint limits define the poses.
-        angle_rad: joint angles at the start.
     """
 
     def __init__(self, arm: Arm, angle_rad: Joints) -> None:
@@ -33,11 +32,8 @@ class ArmHandling:
         """Return the joint angles to hold now, or None while the servos hold the arm.
 
         Args:
-            t_s: world time.
             limp: whether torque is off on all servos.
-            angle_rad: joint angles.
             lights: number of times that an LED was switched on; each time, the arm is moved to the next pose.
-            lit: whether an LED is on.
         """
         if limp and not self._limp:
             self._from = self._to = self._at = angle_rad

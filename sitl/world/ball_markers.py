@@ -25,7 +25,6 @@ class BallMarkers:
     """The markers of each frame that belong to no rigid body; call `frame` once per frame.
 
     Args:
-        config: configuration of the world.
         scene: the scene with the balls; its first machine has the net.
     """
 
@@ -64,7 +63,6 @@ class BallMarkers:
         return (x, y, z)
 
     def _balls(self, t_s: float, since_s: float) -> list[Vec3]:
-        """Return the balls that the cameras see."""
         config, noise_m, found = self._config, self._all.mocap_noise_m, []
         if config.on:
             noise_m = math.hypot(noise_m, config.noise_m)

@@ -75,9 +75,7 @@ class Bar:
     """The bar of a scene; call `step` after each step of the scene.
 
     Args:
-        spec: the bar.
         bodies: the model, as each machine sees it; the first machine has the left end.
-        machines: the two machines.
         events: where grips and a fall are reported.
     """
 
@@ -93,7 +91,6 @@ class Bar:
         half_m = 0.5 * spec.length_m
         self._handles: tuple[Vec3, Vec3] = ((half_m, 0.0, 0.0), (-half_m, 0.0, 0.0))
         self._tips = [data.xpos[each.body("tip")] for each in bodies]
-        self._tip_axes = [data.xmat[each.body("tip")] for each in bodies]
         self._clamps = [model.equality(f"{each.prefix}clamp").id for each in bodies]
         self.gripped = [False, False]
         """Whether each machine's clamp holds its handle."""
@@ -153,7 +150,6 @@ class Bar:
         self._events.report(t_s, "bar_let_go")
 
     def _slips(self, number: int) -> bool:
-        """Return whether the handle is pulled out of the jaws."""
         force = self.pull_n(number)
         return force > self._strength_n
 

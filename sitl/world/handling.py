@@ -83,7 +83,6 @@ class Handling:
 
     Args:
         config: configuration of the world; `handling_t_s`, `handling_taps`, `handling_tap_n`, and `seed` for the hand's sway are used.
-        weight_n: weight of the whole vehicle.
     """
 
     def __init__(self, config: WorldConfig, weight_n: float) -> None:
@@ -99,7 +98,6 @@ class Handling:
         """Return the present force and torque of the hand, or None while it does not hold the vehicle.
 
         Args:
-            t_s: world time.
             q: MuJoCo's qpos, which begins with the position and quaternion of the base (world frame).
             v: MuJoCo's qvel, which begins with the velocity (world frame) and angular rate (body frame) of the base.
         """
@@ -180,7 +178,6 @@ class HungWeight:
         """Return the downward force on the centre of the net in N.
 
         Args:
-            t_s: world time.
             read: whether the force sensor is being read; the weight hangs on the net once reading has lasted `net_weight_t_s`.
         """
         if not read:

@@ -22,12 +22,7 @@ class _Drive(Protocol):
 
 
 class Jaws:
-    """The jaws with their servo; they start open, and stop at the handle.
-
-    Args:
-        config: servo and angles.
-        drive: the servo's motor.
-    """
+    """The jaws with their servo; they start open, and stop at the handle."""
 
     def __init__(self, config: JawsConfig, drive: _Drive) -> None:
         self._drive = drive

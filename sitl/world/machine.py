@@ -57,9 +57,7 @@ class Machine:
 
     Args:
         spec: vehicle file, configuration and start pose, at which the machine is put.
-        bodies: the model of the scene.
         events: where contacts and a crash are reported.
-        surfaces: the surfaces of the scene, or None.
     """
 
     def __init__(self, spec: MachineSpec, bodies: Bodies, events: Events, surfaces: Surfaces | None) -> None:
@@ -92,7 +90,8 @@ class Machine:
         self.wind_m_s = config.wind_m_s
         self.rotor_share: Thrusts | None = None
         """Fraction of each rotor's thrust that remains during a fault; None without a fault."""
-        self._thrust: Thrusts = (0.0,) * layout.count
+        self.thrust_n: Thrusts = (0.0,) * layout.count
+        """Thrust of each rotor in N before ground effect and faults, in PX4's order."""
         self.crashed = False
         # Views: looking up MuJoCo's arrays in every step costs more than reading them.
         base = model.joint(f"{prefix}base").id
@@ -129,7 +128,6 @@ class Machine:
         self.q: list[float] = self._qpos.tolist()
         """The machine's qpos; see `layout`."""
         self.v: list[float] = self._qvel.tolist()
-        """The machine's qvel."""
         self._sensors: list[float] | None = None
         """Sensor values, read from MuJoCo on first access; None until then."""
 
@@ -176,11 +174,6 @@ class Machine:
         return GRAVITY_M_S2 * float(self._model.body_subtreemass[self._base])
 
     @property
-    def thrust_n(self) -> Thrusts:
-        """Thrust of each rotor in N before ground effect and faults, in PX4's order."""
-        return self._thrust
-
-    @property
     def hover_command(self) -> float:
         """True normalised hover thrust (0 to 1) without payload, far from the ground, at the battery's initial charge."""
         ratio = 1.0 if self.battery is None else self.battery.thrust_ratio(self.battery.hover_v)
@@ -198,7 +191,7 @@ class Machine:
         most, rotors, battery = self._rotor_max_n, self._rotors, self.battery
         if battery is not None:
             most *= battery.thrust_ratio(battery.voltage_v)
-        self._thrust = thrust = rotors.step(rotor_commands, most)
+        self.thrust_n = thrust = rotors.step(rotor_commands, most)
         if battery is not None:
             battery.step(PHYSICS_DT_S, thrust)
         near = rotors.ground_effect(self.q[2] + self._rotor_height_m)
@@ -259,7 +252,7 @@ class Machine:
         q, (x, y, z) = self.q, at_world_m
         x, y, z = x - q[0], y - q[1], z - q[2]
         reach_m = self._reach_m + radius_m
-        if self.crashed or x * x + y * y + z * z > reach_m * reach_m or sum(self._thrust) < TURNING_N:
+        if self.crashed or x * x + y * y + z * z > reach_m * reach_m or sum(self.thrust_n) < TURNING_N:
             return
         x, y, z = quat_rotate((q[3], -q[4], -q[5], -q[6]), (x, y, z))
         if abs(z - self._rotor_height_m) < radius_m and any(
@@ -302,7 +295,6 @@ class Machine:
             self._crash(t_s)
 
     def _crash(self, t_s: float, cause: str | None = None) -> None:
-        """End the flight as a crash, after an event with its cause."""
         if self.crashed:
             return
         self.crashed = True

@@ -17,9 +17,7 @@ _PLACE = {"x": 0, "y": 1, "z": 2}
 
 
 class MocapMisalignment:
-    """Converts true poses to streamed poses: p_s = A p, R_s = A R Z A^T. A is given by `world.mocap_axes`, Z is the body's zero
-    error.
-    """
+    """Converts true to streamed poses: p_s = A p, R_s = A R Z A^T; A is `world.mocap_axes`, Z the body's zero error."""
 
     def __init__(self, config: World) -> None:
         names = config.mocap_axes

@@ -15,7 +15,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.arm_chain import TOOL_PART_INERTIA_KG_M2, ChainLink
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_conjugate, quat_from_euler_zyx, quat_multiply, quat_rotate
-from companion.model.types import IDENTITY_QUAT, Joints, Quat, Vec3
+from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 from companion.sitl_config.effects.rotors import of_rotors
 from companion.sitl_config.world import World
 from sitl.world import surfaces
@@ -41,11 +41,6 @@ def base_mass_kg(vehicle: Vehicle, world: World) -> float:
     if tool is not None:
         rest = rest + tool.sensor_mass_kg + tool.beyond_sensor_kg
     return (vehicle.airframe.mass_kg - rest) * (1.0 + world.mass_error)
-
-
-def link_masses_kg(vehicle: Vehicle, world: World) -> Joints:
-    """Return the true masses of the links, without sensor and net, whose masses in the vehicle file are taken as true."""
-    return tuple(link.mass_kg for link in machine.true_chain(vehicle, world).links)
 
 
 def _xyz(values: Vec3) -> str:
@@ -105,7 +100,6 @@ def _links(vehicle: Vehicle, world: World, prefix: str) -> str:
 
 
 def _rod(vehicle: Vehicle, tool: Tool) -> str:
-    """Return the inertia of a rod in the frame of the force-torque sensor."""
     half_m, moments = rod_of(tool)
     back = quat_conjugate(surfaces.sensor_turn(vehicle))
     centre_m = quat_rotate(back, (half_m, 0.0, 0.0))
@@ -226,9 +220,7 @@ def _base(vehicle: Vehicle, world: World, p: str) -> str:
 
 
 def _balls(world: World) -> tuple[str, str, str]:
-    """Return the bodies of the balls, their contacts with the floor, and the constraints that hold them in the net of the first
-    machine.
-    """
+    """Return the balls' bodies, their contacts with the floor, and the constraints of the first machine's net."""
     bodies = pairs = connect = ""
     balls = [(PAYLOAD, CATCH, world.payload_kg)]
     balls += [(SECOND, SECOND_CATCH, f.magnitude) for f in world.faults if f.kind == "payload_double"][:1]
@@ -253,7 +245,6 @@ def mjcf(machines: Sequence[tuple[Vehicle, World]], timestep_s: float, bar: tupl
     Args:
         machines: vehicle file and configuration of each machine; the configuration of the first has the objects of the scene, and its
             machine catches the payload.
-        timestep_s: physics step.
         bar: body, contacts and constraints of the bar that the machines carry.
     """
     vehicle, world = machines[0]

@@ -12,10 +12,7 @@ class OrnsteinUhlenbeck:
     """Independent triples of stationary Ornstein-Uhlenbeck processes with unit RMS, sampled exactly.
 
     Args:
-        count: number of triples.
         correlation_time_s: time after which the autocorrelation has fallen to 1/e.
-        period_s: time between two samples.
-        seed: seed of the world.
         source: number of the noise sequence.
     """
 

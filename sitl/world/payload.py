@@ -54,10 +54,6 @@ class Payload:
     """The payload and the net that catches it; call `step` once per physics step.
 
     Args:
-        machine: the machine with the net.
-        bodies: the model of the scene, as that machine sees it.
-        vehicle: vehicle file of that machine.
-        config: configuration of the world.
         events: where throws and catches are reported.
     """
 
@@ -106,7 +102,6 @@ class Payload:
         """Throw, catch or remove the payload if that is due in this step.
 
         Args:
-            t_s: world time.
             airborne: whether a payload may be thrown.
         """
         ball, kept_since_s = self.ball, self._kept_since_s
@@ -145,7 +140,6 @@ class Payload:
                 self._await_throw()
 
     def _is_due(self, t_s: float) -> bool:
-        """Return whether the person throws in this step."""
         q, (at_x, at_y) = self._machine.q, self._config.catch_at_m
         if self._config.throw_to == "hovering":
             near = q[2] > self._high_m and math.hypot(q[0] - at_x, q[1] - at_y) <= _HOVERS_WITHIN_M
@@ -207,7 +201,6 @@ class Payload:
         self._events.report(t_s, "thrown")
 
     def _take_out(self, ball: Ball, t_s: float) -> None:
-        """Take the payload out of the net, so that it can be thrown again."""
         d = self._data
         self.drop()
         self._kept_since_s = None
@@ -255,10 +248,6 @@ class Payload:
     def catch(self, ball: Ball, t_s: float) -> bool:
         """Return whether the ball is caught: with a bag, once it has settled in the bag; without, once it touches the net, to which
         this call attaches it.
-
-        Args:
-            ball: indices of the ball.
-            t_s: world time.
         """
         return self._caught_s(ball, t_s) is not None
 

@@ -37,7 +37,6 @@ class Scene:
         self.model, self.data = model, mujoco.MjData(model)
         self.loads, self._events = Loads(self.data), Events()
         self.surfaces = Surfaces(first.config, model) if first.config.surfaces else None
-        """Surfaces; None if there are none."""
         bodies = tuple(Bodies(model, self.data, self.loads, prefix) for prefix in prefixes)
         self.machines = tuple(
             Machine(spec, each, self._events, self.surfaces) for spec, each in zip(machines, bodies, strict=True)
@@ -45,7 +44,6 @@ class Scene:
         mujoco.mj_forward(model, self.data)
         self.payload = Payload(self.machines[0], bodies[0], first.vehicle, first.config, self._events)
         self.bar = None if bar is None else Bar(bar, bodies, self.machines, self._events)
-        """The bar that the machines carry; None if there is none."""
         self.t_s = 0.0
 
     def step(self, airborne: bool = True) -> None:

@@ -16,7 +16,6 @@ class Tether:
     """The tether of one machine.
 
     Args:
-        bodies: the model of the scene.
         exists: whether the machine has a tether; without one, the length is infinite and the attachment is the body's origin.
     """
 

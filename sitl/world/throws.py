@@ -23,7 +23,6 @@ def with_throws(config: SitlConfig) -> SitlConfig:
 
 
 def _passes(config: SitlConfig) -> bool:
-    """Return whether the mission's plan passes `catch_at_m` in the +x direction."""
     plan, (at_x, at_y) = Plan.build(config.mission, config.vehicle), config.world.catch_at_m
     course = [plan.reference(n * _STEP_S) for n in range(int(plan.duration_s / _STEP_S))]
     return any(

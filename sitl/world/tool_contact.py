@@ -37,9 +37,6 @@ class ToolContact:
     k d = K R and b = (C + K dt) R. MuJoCo computes R = A (1 - d) / d from the impedance d and the inverse weight A of the tip's body.
 
     Args:
-        surfaces: the surfaces of the scene.
-        vehicle: vehicle file of the machine.
-        bodies: the model of the scene.
         events: where touches and surfaces that give way are reported.
     """
 
@@ -65,7 +62,6 @@ class ToolContact:
         """World time at which the first touch that lasted for `PRESSED_S` began; None before. Interruptions of up to `SAME_S` count."""
         self._run_begin_s = -math.inf
         self.force_max_n = 0.0
-        """Largest contact force."""
         self._forces_n: list[Vec3] = []
         self.rotor_distance_m = self.rotor_distance_min_m = math.inf
         """Smallest distance of a rotor's disk from a surface, now and so far; 0 or less if a rotor touches it."""
@@ -96,8 +92,6 @@ class ToolContact:
         """Watch the contact and the rotors.
 
         Args:
-            t_s: world time.
-            q: the machine's qpos, which begins with the pose of the base.
             tip_m: position of the tip, world frame.
             force_n: force of a surface on the tip, world frame.
         """

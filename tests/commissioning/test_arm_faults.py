@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from companion.cli.main import main
 from companion.commissioning.arm import scan as arm_scan
 from companion.commissioning.arm.scan import judge, scan
 from companion.config.loader import load_vehicle
+from companion.io.dynamixel.port import usb_latency_ms
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
@@ -172,8 +174,9 @@ def test_an_overload_is_cleared_by_a_reboot_that_was_confirmed(tmp_path: Path) -
     assert (code, [(servo["before"], servo["after"]) for servo in found["servos"]]) == (EXIT_OK, [(0, 0), (32, 0)])
 
 
-def test_an_adapter_with_the_factory_latency_timer_is_found(tmp_path: Path) -> None:
+def test_an_adapter_with_the_factory_latency_timer_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a real pty, with the file that the kernel would show for an FTDI adapter."""
+    monkeypatch.setattr(arm_scan, "usb_latency_ms", partial(usb_latency_ms, sysfs=tmp_path))
 
     async def look(latency: str) -> dict[str, str]:
         async with ServoBus([ServoModel(1), ServoModel(2)]) as bus:
@@ -181,7 +184,7 @@ def test_an_adapter_with_the_factory_latency_timer_is_found(tmp_path: Path) -> N
             timer.parent.mkdir(parents=True, exist_ok=True)
             timer.write_text(latency, encoding="utf-8")
             vehicle = load_vehicle(SHIPPED, [f"vehicle.devices.arm.port={bus.path}"])
-            found = await asyncio.to_thread(scan, vehicle.arm_device, sysfs=tmp_path, only=int(FILES))
+            found = await asyncio.to_thread(scan, vehicle.arm_device, only=int(FILES))
             return {row.id: row.fix for row in judge(found, vehicle).rows if not row.ok and row.read.endswith(" ms")}
 
     slow = asyncio.run(look("16\n"))

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from companion.commissioning.force_torque.watch import FtSensor
 from companion.config.devices import ForceDevice
 from companion.config.loader import load_vehicle
+from companion.io.force_torque.driver import RobotousForceTorque
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
 from companion.runtime.clock import flight_clock
 from sitl.force_torque import ForceTorqueServer
@@ -77,7 +77,7 @@ def test_no_sample_from_before_the_sensors_zero_was_set_or_cleared_is_used() -> 
             server.set_wrench((3.0, 4.0, 0.0), (0.0, 0.0, 0.0))
             ticking = asyncio.ensure_future(_tick(server))
             try:
-                async with FtSensor(ForceDevice(port=server.port), flight_clock()) as sensor:
+                async with RobotousForceTorque(ForceDevice(port=server.port), flight_clock()) as sensor:
                     read = []
                     for on in (True, False):
                         await sensor.set_bias(on)

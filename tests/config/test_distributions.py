@@ -25,7 +25,8 @@ from sitl.campaigns.flights import with_world
 from sitl.fast.loop import FastFlight
 from sitl.server import Sitl
 from sitl.wires import MachineWires, Ports
-from sitl.world.model import base_mass_kg, link_masses_kg
+from sitl.world.effects.machine import true_chain
+from sitl.world.model import base_mass_kg
 from sitl.world.start import start_of
 from tests.support import HOVER, tool_of
 
@@ -236,7 +237,7 @@ def test_both_loops_fly_the_machine_with_the_model_error() -> None:
     plant = Sitl([wires]).machines[0].plant
     assert plant.machine.weight_n == true
     tool, errs = tool_of(config.vehicle), with_model_error(config.world, 2)
-    links_kg = link_masses_kg(config.vehicle, errs)
+    links_kg = [link.mass_kg for link in true_chain(config.vehicle, errs).links]
     true_kg = base_mass_kg(config.vehicle, errs) + sum(links_kg) + tool.sensor_mass_kg + tool.beyond_sensor_kg
     assert true == pytest.approx(GRAVITY_M_S2 * true_kg, rel=1e-6)
     assert true != pytest.approx(believed, rel=0.05)

@@ -24,9 +24,9 @@ from companion.control.common import (
 )
 from companion.control.thrust import ForceLimits, TiltFilter, saturate_force
 from companion.control.types import PlantState
-from companion.mission.reference import at_rest
 from companion.model.frames import quat_from_euler_zyx, quat_rotate, wrap_rad, yaw_from_quat
 from companion.model.types import Vec3
+from tests.control.states import at_rest
 
 CONFIG = load_flight("configs/missions/catch.yaml")
 VEHICLE, LAW = CONFIG.vehicle, cast(LawConfig, CONFIG.controller)

@@ -13,9 +13,8 @@ from companion.config.controller import AdaptiveConfig
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.types import PlantState, Wrench
-from companion.mission.reference import at_rest
 from companion.model.types import IDENTITY_QUAT, Joints
-from tests.control.states import at
+from tests.control.states import at, at_rest
 
 FOLD: Joints = (math.radians(165), math.radians(140))
 HOVER = 0.49

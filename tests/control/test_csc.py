@@ -14,13 +14,12 @@ from companion.control.arm_model import dynamics_of
 from companion.control.csc import CscController
 from companion.control.types import PlantState, Wrench
 from companion.core.flight_core import FlightCore
-from companion.mission.reference import at_rest
 from companion.model.frames import rotation_matrix
 from companion.model.types import IDENTITY_QUAT, PhaseKind, Vec3
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
-from tests.control.states import POSE, ZERO, at
+from tests.control.states import POSE, ZERO, at, at_rest
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
 
 MISSION = "configs/missions/catch.yaml"

@@ -20,10 +20,9 @@ from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController, Row, rows_of
 from companion.control.arm_model import manipulator_of
 from companion.control.types import PlantState
-from companion.mission.reference import at_rest
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import IDENTITY_QUAT, Vec3
-from tests.control.states import at
+from tests.control.states import at, at_rest
 
 Array = npt.NDArray[np.float64]
 DT_S = 0.005

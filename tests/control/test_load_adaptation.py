@@ -17,11 +17,10 @@ from companion.config.loader import load_flight
 from companion.control.adaptive import Adaptation, AdaptiveController
 from companion.control.arm_model import manipulator_of
 from companion.control.load_adaptation import LoadAdaptation
-from companion.mission.reference import at_rest
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.outputs import ControlLog
 from companion.model.types import Joints, Matrix
-from tests.control.states import POSE, ZERO, at
+from tests.control.states import POSE, ZERO, at, at_rest
 
 CONFIG = load_flight("configs/missions/catch.yaml", preset="recommended")
 MANIPULATOR = manipulator_of(CONFIG.vehicle)

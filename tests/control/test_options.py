@@ -13,9 +13,8 @@ from companion.config.loader import FlightConfig, load_flight
 from companion.control.adaptive import AdaptiveController
 from companion.control.common import Actuation
 from companion.control.disturbance import DisturbanceObserver
-from companion.mission.reference import at_rest
 from companion.model.types import Joints, Reference, Vec3
-from tests.control.states import at
+from tests.control.states import at, at_rest
 
 POSE: Joints = (math.radians(100), math.radians(60))
 ZERO: Vec3 = (0.0, 0.0, 0.0)

@@ -14,14 +14,13 @@ from companion.config.controller import PscConfig
 from companion.control.payload_mass import PayloadEstimator
 from companion.control.psc import PscController
 from companion.control.types import PlantState, Wrench
-from companion.mission.reference import at_rest
 from companion.model.types import PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from tests.analysis.recorded import record
-from tests.control.states import POSE, at
+from tests.control.states import POSE, at, at_rest
 from tests.flights.ends import after
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
 from tests.support import SHORT_CATCH

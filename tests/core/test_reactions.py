@@ -19,7 +19,6 @@ from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.air import NOTHING, Air, Expectation, Observation
 from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
-from companion.mission.reference import at_rest
 from companion.model.algebra import plus
 from companion.model.flight_stage import Stage
 from companion.model.outputs import TetherState
@@ -38,6 +37,7 @@ from companion.model.types import (
 from companion.phases.contact import force
 from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.supervisor import SupervisorState
+from tests.control.states import at_rest
 from tests.safety.healthy import SLOW, healthy, put
 
 CONFIG = load_flight("configs/missions/catch.yaml")

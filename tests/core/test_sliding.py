@@ -17,7 +17,6 @@ from companion.control import slide as control
 from companion.control.arm_model import manipulator_of
 from companion.core.flight_core import FlightCore
 from companion.mission.check import check_mission
-from companion.mission.reference import at_rest
 from companion.model.contact import ContactMode
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.outputs import Outputs
@@ -28,7 +27,7 @@ from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import row_of
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
-from tests.control.states import ZERO, at
+from tests.control.states import ZERO, at, at_rest
 from tests.flights.ends import after, contact_over, flown_until
 
 SLIDE = "configs/missions/slide.yaml"

@@ -218,7 +218,7 @@ class DynamixelTarget(Target):
 
     def _no_problem(self, arm: DynamixelArm) -> None:
         if arm.problem:
-            problem, arm._problem = arm.problem, ""
+            problem, arm.problem = arm.problem, ""
             raise Wrong(f"an exception inside the bus code: {problem}")
 
     def _new(self) -> tuple[DynamixelArm, ArmBus]:

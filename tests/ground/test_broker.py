@@ -26,7 +26,8 @@ from paho.mqtt.properties import Properties
 from companion.ground.broker import setup as broker_setup
 from companion.ground.protocol.commands import Accepted, Reason, Refused, Verifier, make_command
 from companion.ground.protocol.keys import load_login, load_operators
-from companion.ground.protocol.messages import Command, Topic, encode
+from companion.ground.protocol.messages import Command, Topic
+from companion.model.codec import to_json
 from companion.model.types import OperatorCommand
 from tests.broker import LOOPBACK, Broker, loopback_broker
 from tests.support import DEADLINE_S, ROOT, free_port
@@ -376,7 +377,7 @@ def test_open_broker_lets_it_pass_and_the_vehicle_refuses(site: Site, tmp_path: 
     key = load_operators(site.folder / "operators/anna/operators.yaml").key("anna")
     judge = Verifier(operators, "tarot", SESSION)
     with loopback_broker(tmp_path) as broker, Peer(broker.port) as vehicle, Peer(broker.port) as stranger:
-        genuine = encode(signed(key))
+        genuine = to_json(signed(key))
         if reason is Reason.RETAINED:
             stranger.publish(COMMAND, genuine, retain=True)
         vehicle.subscribe(COMMAND)
@@ -390,7 +391,7 @@ def test_open_broker_lets_it_pass_and_the_vehicle_refuses(site: Site, tmp_path: 
         verdict = judge.check(payload, retained, NOW_T_S)
         assert isinstance(verdict, Refused)
         assert verdict.reason is reason
-        stranger.publish(COMMAND, encode(signed(key)))
+        stranger.publish(COMMAND, to_json(signed(key)))
         _, payload, retained = vehicle.hear()
         assert isinstance(judge.check(payload, retained, NOW_T_S), Accepted), "a genuine one passes as before"
 

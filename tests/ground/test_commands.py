@@ -26,7 +26,8 @@ from companion.ground.protocol.commands import (
 )
 from companion.ground.protocol.flight_clock import FlightClock
 from companion.ground.protocol.keys import Operator, Operators, Permission, new_key
-from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command, encode
+from companion.ground.protocol.messages import COMMAND_MAX_BYTES, Command
+from companion.model.codec import to_json
 from companion.model.commands import COMMANDS, TABLE
 from companion.model.types import OperatorCommand
 
@@ -69,7 +70,7 @@ def judged(
 
 
 def changed(of: Command, /, **values: Any) -> bytes:
-    data = json.loads(encode(of))
+    data = json.loads(to_json(of))
     data.update(values)
     return json.dumps(data).encode()
 
@@ -77,12 +78,12 @@ def changed(of: Command, /, **values: Any) -> bytes:
 @pytest.mark.parametrize("name", COMMANDS.values())
 def test_genuine_command_is_accepted_as_it_was_made(name: OperatorCommand) -> None:
     command = made(name)
-    assert verifier().check(encode(command), False, NOW_T_S) == Accepted(command)
+    assert verifier().check(to_json(command), False, NOW_T_S) == Accepted(command)
 
 
 def test_white_space_and_field_order_of_the_json_do_not_matter() -> None:
     """White space and field order are the sender's choice: the content is signed."""
-    data = json.loads(encode(made()))
+    data = json.loads(to_json(made()))
     payload = json.dumps(dict(reversed(data.items())), indent=1).encode()
     assert judged(payload) is None
 
@@ -110,7 +111,7 @@ def test_signed_text_is_as_documented() -> None:
 def test_signed_fields_cannot_be_shifted_into_each_other(field: str) -> None:
     command = replace(made(), **{field: "a\nb"})
     if field == "mac":
-        assert judged(encode(command)) is Reason.MALFORMED
+        assert judged(to_json(command)) is Reason.MALFORMED
     else:
         with pytest.raises(ValueError, match=field):
             sign(command, ANNA)
@@ -120,13 +121,13 @@ UNSIGNED = {
     "unsigned": (changed(made(), mac=""), Reason.MALFORMED),
     "mac of another text": (changed(made(), mac="0" * 64), Reason.BAD_SIGNATURE),
     "mac missing": (
-        json.dumps({k: v for k, v in json.loads(encode(made())).items() if k != "mac"}).encode(),
+        json.dumps({k: v for k, v in json.loads(to_json(made())).items() if k != "mac"}).encode(),
         Reason.MALFORMED,
     ),
-    "viewer signs as anna": (encode(made(key=VIEWER)), Reason.BAD_SIGNATURE),
-    "operator signs as another": (encode(made(key=BERT)), Reason.BAD_SIGNATURE),
-    "viewer signs as himself": (encode(made(operator="viewer", key=VIEWER)), Reason.UNKNOWN_OPERATOR),
-    "wrong vehicle": (encode(made(vehicle="other")), Reason.WRONG_VEHICLE),
+    "viewer signs as anna": (to_json(made(key=VIEWER)), Reason.BAD_SIGNATURE),
+    "operator signs as another": (to_json(made(key=BERT)), Reason.BAD_SIGNATURE),
+    "viewer signs as himself": (to_json(made(operator="viewer", key=VIEWER)), Reason.UNKNOWN_OPERATOR),
+    "wrong vehicle": (to_json(made(vehicle="other")), Reason.WRONG_VEHICLE),
     "re-addressed": (changed(made(vehicle="other"), vehicle=VEHICLE), Reason.BAD_SIGNATURE),
     "hold made a start": (changed(made(), command="start"), Reason.BAD_SIGNATURE),
     "made fresh again": (changed(made(t_s=10.0), t_ms=100_000), Reason.BAD_SIGNATURE),
@@ -146,10 +147,10 @@ UNSIGNED = {
     "hold is endless": (changed(made(), hold=10**400), Reason.MALFORMED),
     "hold is negative": (changed(made(), hold=-1), Reason.MALFORMED),
     "another hold": (changed(made(), hold=1), Reason.BAD_SIGNATURE),
-    "a field twice": (encode(made())[:-1] + b',"command":"start"}', Reason.MALFORMED),
-    "a field twice, the same": (encode(made())[:-1] + b',"v":2}', Reason.MALFORMED),
-    "UTF-16": (encode(made()).decode().encode("utf-16"), Reason.MALFORMED),
-    "not UTF-8": (encode(made()).replace(b"anna", b"an\xffa"), Reason.MALFORMED),
+    "a field twice": (to_json(made())[:-1] + b',"command":"start"}', Reason.MALFORMED),
+    "a field twice, the same": (to_json(made())[:-1] + b',"v":2}', Reason.MALFORMED),
+    "UTF-16": (to_json(made()).decode().encode("utf-16"), Reason.MALFORMED),
+    "not UTF-8": (to_json(made()).replace(b"anna", b"an\xffa"), Reason.MALFORMED),
     "half a character": (changed(made(), operator="\ud800"), Reason.MALFORMED),
     "upper case mac": (changed(made(), mac="A" * 64), Reason.MALFORMED),
     "empty": (b"", Reason.MALFORMED),
@@ -159,7 +160,7 @@ UNSIGNED = {
     "terminal codes": (b'{"v":2,"\\u001b[2J\\n":1}', Reason.MALFORMED),
     "largest": (b" " * COMMAND_MAX_BYTES, Reason.MALFORMED),
     "oversized": (b" " * (COMMAND_MAX_BYTES + 1), Reason.OVERSIZED),
-    "genuine but oversized": (encode(made()) + b" " * COMMAND_MAX_BYTES, Reason.OVERSIZED),
+    "genuine but oversized": (to_json(made()) + b" " * COMMAND_MAX_BYTES, Reason.OVERSIZED),
 }
 
 
@@ -172,7 +173,7 @@ def test_refused_and_never_answered(payload: bytes, reason: Reason) -> None:
 
 
 def test_retained_is_refused_though_genuine() -> None:
-    judge, payload = verifier(), encode(made())
+    judge, payload = verifier(), to_json(made())
     assert judged(payload, judge, retained=True) is Reason.RETAINED
     assert judged(payload, judge) is Reason.REPLAYED
     assert judged(UNSIGNED["viewer signs as anna"][0], judge, retained=True) is Reason.BAD_SIGNATURE
@@ -181,8 +182,8 @@ def test_retained_is_refused_though_genuine() -> None:
 def test_unsigned_floods_do_not_stop_a_genuine_command() -> None:
     """Whatever is sent without a key (garbage, copies, old or foreign commands), all commands of an operator pass."""
     judge = verifier()
-    old = [encode(made(t_s=NOW_T_S - 60.0)) for _ in range(50)]
-    first = encode(made(OperatorCommand.START))
+    old = [to_json(made(t_s=NOW_T_S - 60.0)) for _ in range(50)]
+    first = to_json(made(OperatorCommand.START))
     assert judged(first, judge) is None
     for number in range(2000):
         assert judged(first, judge) is Reason.REPLAYED
@@ -190,17 +191,17 @@ def test_unsigned_floods_do_not_stop_a_genuine_command() -> None:
         assert judged(first, judge, retained=True) is Reason.REPLAYED
         assert judged(UNSIGNED["viewer signs as anna"][0], judge) is Reason.BAD_SIGNATURE
     for name in COMMANDS.values():
-        assert judged(encode(made(name, NOW_T_S + 1.0)), judge, now_t_s=NOW_T_S + 1.0) is None
+        assert judged(to_json(made(name, NOW_T_S + 1.0)), judge, now_t_s=NOW_T_S + 1.0) is None
 
 
 @pytest.mark.parametrize("name", COMMANDS.values())
 def test_freshness_at_its_edges(name: OperatorCommand) -> None:
     age_max_s = LIMITS[name].age_max_s
     assert age_max_s == (5.0 if name in SAFE else 2.0)
-    assert judged(encode(made(name, NOW_T_S - age_max_s + 0.001))) is None
-    assert judged(encode(made(name, NOW_T_S - age_max_s - 0.001))) is Reason.STALE
-    assert judged(encode(made(name, NOW_T_S + AHEAD_MAX_S - 0.001))) is None
-    assert judged(encode(made(name, NOW_T_S + AHEAD_MAX_S + 0.001))) is Reason.FROM_THE_FUTURE
+    assert judged(to_json(made(name, NOW_T_S - age_max_s + 0.001))) is None
+    assert judged(to_json(made(name, NOW_T_S - age_max_s - 0.001))) is Reason.STALE
+    assert judged(to_json(made(name, NOW_T_S + AHEAD_MAX_S - 0.001))) is None
+    assert judged(to_json(made(name, NOW_T_S + AHEAD_MAX_S + 0.001))) is Reason.FROM_THE_FUTURE
 
 
 def first_refusal_is_the_end(reasons: list[Reason | None]) -> bool:
@@ -219,7 +220,7 @@ def test_a_command_is_accepted_once_at_most_and_never_after_its_first_refusal(
     times_t_s: list[float | None], name: OperatorCommand, who: tuple[str, bytes], ahead_s: float, data: st.DataObject
 ) -> None:
     """Copies may arrive at any time: before the flight starts, retained, with clock steps in any order."""
-    judge, payload = verifier(), encode(made(name, NOW_T_S + ahead_s, *who))
+    judge, payload = verifier(), to_json(made(name, NOW_T_S + ahead_s, *who))
     reasons = []
     for t_s in times_t_s:
         now_t_s = None if t_s is None else NOW_T_S + t_s
@@ -237,7 +238,7 @@ def test_none_of_many_commands_is_accepted_after_its_first_refusal(
 ) -> None:
     """Many commands are sent repeatedly in any order, next to floods that leave no room for their nonces."""
     judge, now_t_s = verifier(), NOW_T_S
-    payloads = [encode(made(name, NOW_T_S + ahead_s)) for name, ahead_s in made_at]
+    payloads = [to_json(made(name, NOW_T_S + ahead_s)) for name, ahead_s in made_at]
     flood_s = data.draw(st.sampled_from([0.0, 40.0, 100.0]))
     floods = {name for name, _ in made_at}
     reasons: dict[bytes, list[Reason | None]] = {payload: [] for payload in payloads}
@@ -245,7 +246,7 @@ def test_none_of_many_commands_is_accepted_after_its_first_refusal(
         now_t_s += data.draw(st.sampled_from([0.0, 0.01, 1.0, 10.0]))
         name = data.draw(st.sampled_from(list(COMMANDS.values())))
         for _ in range(REFUSED_MAX + 40 if name in floods else 0):
-            judged(encode(made(name, NOW_T_S + flood_s)), judge, now_t_s=now_t_s)
+            judged(to_json(made(name, NOW_T_S + flood_s)), judge, now_t_s=now_t_s)
         floods.discard(name)
         payload = data.draw(st.sampled_from(payloads))
         reasons[payload].append(judged(payload, judge, now_t_s=now_t_s))
@@ -255,7 +256,7 @@ def test_none_of_many_commands_is_accepted_after_its_first_refusal(
 
 def test_a_start_that_was_from_the_future_is_not_accepted_when_its_time_has_come() -> None:
     """A forged clock made an operator sign it; a copy is sent again 60 s later."""
-    judge, payload = verifier(), encode(made(OperatorCommand.START, NOW_T_S + 60.0))
+    judge, payload = verifier(), to_json(made(OperatorCommand.START, NOW_T_S + 60.0))
     assert judged(payload, judge) is Reason.FROM_THE_FUTURE
     assert judged(payload, judge, now_t_s=NOW_T_S + 60.0) is Reason.REPLAYED
 
@@ -267,26 +268,26 @@ def test_a_resume_or_start_that_was_given_before_a_stop_is_refused_after_it(
 ) -> None:
     """The network may reorder them, and two operators may use different paths."""
     judge = verifier()
-    assert judged(encode(made(stop, NOW_T_S, "bert", BERT)), judge) is None
-    assert judged(encode(made(name, NOW_T_S - 0.5)), judge) is Reason.OVERTAKEN
-    assert judged(encode(made(name, NOW_T_S + 0.5)), judge, now_t_s=NOW_T_S + 0.5) is None
+    assert judged(to_json(made(stop, NOW_T_S, "bert", BERT)), judge) is None
+    assert judged(to_json(made(name, NOW_T_S - 0.5)), judge) is Reason.OVERTAKEN
+    assert judged(to_json(made(name, NOW_T_S + 0.5)), judge, now_t_s=NOW_T_S + 0.5) is None
 
 
 def test_clock_that_is_set_back_revives_nothing() -> None:
-    judge, payload = verifier(), encode(made())
+    judge, payload = verifier(), to_json(made())
     assert judged(payload, judge) is None
-    assert judged(encode(made(t_s=200.0)), judge, now_t_s=200.0) is None
+    assert judged(to_json(made(t_s=200.0)), judge, now_t_s=200.0) is None
     assert judged(payload, judge, now_t_s=NOW_T_S) is Reason.STALE
 
 
 def test_command_of_an_earlier_flight_is_refused() -> None:
-    assert judged(encode(made(session="f3a8"))) is Reason.WRONG_SESSION
+    assert judged(to_json(made(session="f3a8"))) is Reason.WRONG_SESSION
 
 
 def test_operator_for_safety_only() -> None:
     for name in COMMANDS.values():
         expected = None if name in SAFE else Reason.NOT_ALLOWED
-        assert judged(encode(made(name, operator="bert", key=BERT))) is expected
+        assert judged(to_json(made(name, operator="bert", key=BERT))) is expected
 
 
 @pytest.mark.parametrize("name", COMMANDS.values())
@@ -294,13 +295,13 @@ def test_rate_is_limited_per_command_and_operator(name: OperatorCommand) -> None
     judge, per_s = verifier(), LIMITS[name].per_s
     assert per_s == (20 if name in SAFE else 1)
     for _ in range(per_s):
-        assert judged(encode(made(name)), judge) is None
-    assert judged(encode(made(name)), judge) is Reason.TOO_MANY
+        assert judged(to_json(made(name)), judge) is None
+    assert judged(to_json(made(name)), judge) is Reason.TOO_MANY
     for other in COMMANDS.values():
         if other is not name:
-            assert judged(encode(made(other)), judge) is None
-    assert judged(encode(made(OperatorCommand.HOLD, operator="bert", key=BERT)), judge) is None
-    assert judged(encode(made(name, NOW_T_S + 1.0)), judge, now_t_s=NOW_T_S + 1.0) is None
+            assert judged(to_json(made(other)), judge) is None
+    assert judged(to_json(made(OperatorCommand.HOLD, operator="bert", key=BERT)), judge) is None
+    assert judged(to_json(made(name, NOW_T_S + 1.0)), judge, now_t_s=NOW_T_S + 1.0) is None
 
 
 @pytest.mark.parametrize("flood", COMMANDS.values())
@@ -309,24 +310,24 @@ def test_a_flood_of_one_command_leaves_room_for_every_other(flood: OperatorComma
     """A defective client sends well-signed commands of one operator as fast as it can."""
     judge = verifier()
     for _ in range(2 * REFUSED_MAX):
-        judged(encode(made(flood, NOW_T_S + ahead_s)), judge)
+        judged(to_json(made(flood, NOW_T_S + ahead_s)), judge)
     for name in COMMANDS.values():
         if name is not flood:
-            assert judged(encode(made(name, NOW_T_S + 0.1)), judge, now_t_s=NOW_T_S + 0.1) is None
+            assert judged(to_json(made(name, NOW_T_S + 0.1)), judge, now_t_s=NOW_T_S + 0.1) is None
     if not ahead_s:
-        assert judged(encode(made(flood, NOW_T_S + 1.1)), judge, now_t_s=NOW_T_S + 1.1) is None, "and for its own"
+        assert judged(to_json(made(flood, NOW_T_S + 1.1)), judge, now_t_s=NOW_T_S + 1.1) is None, "and for its own"
 
 
 def test_a_flood_from_the_far_future_closes_its_own_dates_only() -> None:
     """Commands whose nonces were not kept are refused when their time comes; those for now or for later times are not."""
-    judge, flood = verifier(), [encode(made(t_s=NOW_T_S + 60.0)) for _ in range(REFUSED_MAX + 2)]
+    judge, flood = verifier(), [to_json(made(t_s=NOW_T_S + 60.0)) for _ in range(REFUSED_MAX + 2)]
     for payload in flood:
         judged(payload, judge)
     for _ in range(30):
-        judged(encode(made()), judge)  # and too many now, without room for their nonces either
+        judged(to_json(made()), judge)  # and too many now, without room for their nonces either
     for later_s in (1.1, 59.0, 61.0):
         t_s = NOW_T_S + later_s
-        assert judged(encode(made(t_s=t_s)), judge, now_t_s=t_s) is None
+        assert judged(to_json(made(t_s=t_s)), judge, now_t_s=t_s) is None
         for payload in (flood[0], flood[-1]):
             assert judged(payload, judge, now_t_s=t_s) is Reason.REPLAYED
 
@@ -337,29 +338,29 @@ def test_memory_is_bounded_and_forgets() -> None:
         expected = None if number < 20 else Reason.TOO_MANY if number < 20 + REFUSED_MAX else Reason.REPLAYED
         if number == 20 + REFUSED_MAX:
             expected = Reason.TOO_MANY  # the first that finds no room: from now on their date is known
-        assert judged(encode(made()), judge) is expected
+        assert judged(to_json(made()), judge) is expected
     assert max(heard.size for heard in judge._histories.values()) == 20 + REFUSED_MAX
-    assert judged(encode(made(operator="bert", key=BERT)), judge) is None, "another operator is not touched"
-    assert judged(encode(made(t_s=106.0)), judge, now_t_s=106.0) is None
+    assert judged(to_json(made(operator="bert", key=BERT)), judge) is None, "another operator is not touched"
+    assert judged(to_json(made(t_s=106.0)), judge, now_t_s=106.0) is None
     assert sum(heard.size for heard in judge._histories.values()) == 1
 
 
 def test_answers_to_refused_signed_commands_are_rate_limited() -> None:
     judge = verifier()
     stale = made(t_s=0.0)
-    answers = [judge.check(encode(stale), False, NOW_T_S) for _ in range(1000)]
+    answers = [judge.check(to_json(stale), False, NOW_T_S) for _ in range(1000)]
     assert {reason_of(answer) for answer in answers} == {Reason.STALE}
     assert [answer.command for answer in answers if isinstance(answer, Refused) and answer.command] == [
         stale
     ] * ACKS_PER_S
-    again = judge.check(encode(stale), False, NOW_T_S + 1.0)
+    again = judge.check(to_json(stale), False, NOW_T_S + 1.0)
     assert isinstance(again, Refused)
     assert again.command == stale
 
 
 @given(st.data())
 def test_any_changed_byte_is_refused(data: st.DataObject) -> None:
-    payload = bytearray(encode(made(data.draw(st.sampled_from(list(COMMANDS.values()))))))
+    payload = bytearray(to_json(made(data.draw(st.sampled_from(list(COMMANDS.values()))))))
     where = data.draw(st.integers(0, len(payload) - 1))
     payload[where] ^= data.draw(st.integers(1, 255))
     assert judged(bytes(payload)) is not None
@@ -369,7 +370,7 @@ def test_any_changed_byte_is_refused(data: st.DataObject) -> None:
 def test_any_changed_byte_of_the_key_is_refused(data: st.DataObject) -> None:
     key = bytearray(ANNA)
     key[data.draw(st.integers(0, len(key) - 1))] ^= data.draw(st.integers(1, 255))
-    assert judged(encode(made(key=bytes(key)))) is Reason.BAD_SIGNATURE
+    assert judged(to_json(made(key=bytes(key)))) is Reason.BAD_SIGNATURE
 
 
 SCALAR = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20)
@@ -384,7 +385,7 @@ def test_random_bytes_are_refused(payload: bytes) -> None:
 @given(st.dictionaries(st.sampled_from(Command.__struct_fields__), JSON, max_size=8))
 def test_random_json_in_our_fields_is_refused(values: dict[str, Any]) -> None:
     command = made()
-    original = json.loads(encode(command))
+    original = json.loads(to_json(command))
     unchanged = all(type(value) is type(original[name]) and value == original[name] for name, value in values.items())
     assert (judged(changed(command, **values)) is None) == unchanged
 

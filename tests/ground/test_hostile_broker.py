@@ -18,14 +18,14 @@ from rich.console import Console
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.commands import Accepted, Verifier, make_command
 from companion.ground.protocol.connection import Connection
-from companion.ground.protocol.messages import VERSION, Preflight, PreflightRow, Presence, Stream, Topic, encode
+from companion.ground.protocol.messages import VERSION, Preflight, PreflightRow, Presence, Stream, Topic
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.station.hub import Hub, Outbox
 from companion.ground.station.station import Station
 from companion.ground.station.text_view import StationStatus, render, status_line
 from companion.ground.station.vehicles import LIVE_S, VehicleTracker
 from companion.ground.telemetry.scene import scene_of
-from companion.model.codec import to_jsonable
+from companion.model.codec import to_json, to_jsonable
 from companion.model.types import OperatorCommand
 from companion.runtime.tasks import until_first
 from tests.broker import Broker
@@ -41,7 +41,7 @@ def stream_of(t_s: float = 1.0, session: str = "s1", **values: Any) -> Stream:
 
 
 def proven(stream: Stream, vehicle: str = "rig") -> bytes:
-    return encode(with_proofs(stream, vehicle, [b"b" * 32, ANNA.key]))
+    return to_json(with_proofs(stream, vehicle, [b"b" * 32, ANNA.key]))
 
 
 def flying(t_s: float = 100.0) -> VehicleTracker:
@@ -57,14 +57,14 @@ def flying(t_s: float = 100.0) -> VehicleTracker:
 def forged(watch: VehicleTracker) -> dict[str, bytes]:
     genuine = with_proofs(stream_of(100.05), "rig", [ANNA.key])
     return {
-        "no proof": encode(stream_of(160.0)),
-        "the proof of another message": encode(replace(genuine, t_s=160.0)),
-        "proven with another key": encode(with_proofs(stream_of(160.0), "rig", [b"x" * 32])),
+        "no proof": to_json(stream_of(160.0)),
+        "the proof of another message": to_json(replace(genuine, t_s=160.0)),
+        "proven with another key": to_json(with_proofs(stream_of(160.0), "rig", [b"x" * 32])),
         "proven for another vehicle": proven(stream_of(160.0), "other"),
-        "of another flight": encode(stream_of(160.0, "s2")),
-        "many proofs": encode(stream_of(160.0, proofs=("0" * 32,) * 500)),
-        "proofs that are no text of ours": encode(stream_of(160.0, proofs=("\ud800", "", "\0"))),
-        "another hold": encode(replace(genuine, hold=7)),
+        "of another flight": to_json(stream_of(160.0, "s2")),
+        "many proofs": to_json(stream_of(160.0, proofs=("0" * 32,) * 500)),
+        "proofs that are no text of ours": to_json(stream_of(160.0, proofs=("\ud800", "", "\0"))),
+        "another hold": to_json(replace(genuine, hold=7)),
     }
 
 
@@ -77,7 +77,7 @@ def test_a_forged_stream_does_not_make_a_station_sign_for_the_future(name: str) 
     assert known is not None
     assert (known.session, known.now_ms(50.1), known.hold) == ("s1", 100_100, 0)
     command = make_command(OperatorCommand.START, "rig", known.session, "anna", ANNA.key, known.now_ms(50.1))
-    assert isinstance(Verifier(OPERATORS, "rig", "s1").check(encode(command), False, 100.11), Accepted)
+    assert isinstance(Verifier(OPERATORS, "rig", "s1").check(to_json(command), False, 100.11), Accepted)
 
 
 def test_a_copy_of_an_earlier_message_is_not_shown_as_new() -> None:
@@ -97,7 +97,7 @@ def test_a_copy_of_the_newest_message_does_not_make_a_dead_link_look_alive() -> 
     assert known is not None and not known.live(70.0)
     assert known.now_ms(70.0) == 120_000
     command = make_command(OperatorCommand.HOLD, "rig", known.session, "anna", ANNA.key, known.now_ms(70.0))
-    assert isinstance(Verifier(OPERATORS, "rig", "s1").check(encode(command), False, 120.01), Accepted)
+    assert isinstance(Verifier(OPERATORS, "rig", "s1").check(to_json(command), False, 120.01), Accepted)
 
 
 def test_a_recording_of_an_earlier_flight_does_not_replace_the_current_one() -> None:
@@ -125,7 +125,7 @@ def test_the_next_flight_is_taken_though_the_clock_on_the_wall_was_set_back() ->
 def test_without_a_key_everything_is_shown() -> None:
     watch = VehicleTracker()
     for t_s in (100.0, 160.0):
-        assert watch.receive(STREAM, encode(stream_of(t_s)), False, 50.0) is not None
+        assert watch.receive(STREAM, to_json(stream_of(t_s)), False, 50.0) is not None
     assert watch.vehicles["rig"].proven is None
 
 
@@ -133,11 +133,11 @@ def test_an_answer_without_the_vehicles_proof_is_rejected() -> None:
     """Otherwise anyone who reads the nonce could answer "landing" and end the attempts."""
     ack = ack_of("s1", command=OperatorCommand.LAND, text="landing", action="land")
     watch, topic = VehicleTracker(signer=SIGNER), "companion/rig/ack"
-    assert watch.receive(topic, encode(ack), False, 50.0) is None
-    assert watch.receive(topic, encode(replace(with_proof(ack, "rig", ANNA.key), accepted=False)), False, 50.0) is None
-    assert watch.receive(topic, encode(with_proof(ack, "other", ANNA.key)), False, 50.0) is None
-    assert watch.receive(topic, encode(with_proof(ack, "rig", ANNA.key)), False, 50.0) is not None
-    assert watch.receive(topic, encode(replace(ack, operator="bert")), False, 50.0) is not None
+    assert watch.receive(topic, to_json(ack), False, 50.0) is None
+    assert watch.receive(topic, to_json(replace(with_proof(ack, "rig", ANNA.key), accepted=False)), False, 50.0) is None
+    assert watch.receive(topic, to_json(with_proof(ack, "other", ANNA.key)), False, 50.0) is None
+    assert watch.receive(topic, to_json(with_proof(ack, "rig", ANNA.key)), False, 50.0) is not None
+    assert watch.receive(topic, to_json(replace(ack, operator="bert")), False, 50.0) is not None
 
 
 # -- numbers and everything else ---------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ def genuine() -> dict[Topic, dict[str, Any]]:
         Topic.STREAM: stream_of(hold=1, proofs=("0" * 32,)),
         Topic.ACK: ack,
     }
-    return {topic: json.loads(encode(record)) for topic, record in records.items()}
+    return {topic: json.loads(to_json(record)) for topic, record in records.items()}
 
 
 def places(data: Any, path: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
@@ -247,7 +247,7 @@ async def test_land_is_sent_and_answered_whatever_a_hostile_broker_sends(broker:
                 state_of("rig", "s1", commands=False, text="hears nothing"),
                 state_of("rig", "another flight"),
             ):
-                await hostile.publish(Topic.STATE.of("rig"), encode(lie), qos=1, retain=True)
+                await hostile.publish(Topic.STATE.of("rig"), to_json(lie), qos=1, retain=True)
                 await until(lambda lie=lie: watch.vehicles["rig"].state == lie)  # type: ignore[misc]
                 ack = await station.commands.send("rig", OperatorCommand.LAND, lambda note: None)
                 assert ack is not None and ack.accepted

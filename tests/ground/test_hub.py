@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from companion.ground.protocol.messages import VERSION, Events, Presence, Topic, encode
+from companion.ground.protocol.messages import VERSION, Events, Presence, Topic
 from companion.ground.protocol.proof import Signer, with_proofs
 from companion.ground.station.hub import FRESH_S, OUTBOX_MAX, TOO_SLOW, Hub, Outbox
 from companion.ground.station.vehicles import LIVE_S, VEHICLES_MAX, ReceivedRecord, VehicleTracker
 from companion.ground.station.web_guard import host_allowed, origin_allowed, same_token
+from companion.model.codec import to_json
 from tests.ground.monitor_rig import ANNA, SIGNER
 from tests.ground.vehicle import ack_of, flight, state_of
 from tests.support import DEADLINE_S
@@ -22,7 +23,7 @@ SESSION = "s1"
 
 
 def stream_of(session: str = SESSION, t_s: float = 1.0, **values: Any) -> bytes:
-    return encode(replace(flight()[1][30], session=session, t_s=t_s, **values))
+    return to_json(replace(flight()[1][30], session=session, t_s=t_s, **values))
 
 
 def took(outbox: Outbox) -> list[Any]:
@@ -50,7 +51,7 @@ RUBBISH: dict[str, tuple[str, bytes]] = {
         stream_of(progress=0.25).replace(b'"progress":0.25', b'"progress":1e999'),
     ),
     "another record": ("companion/rig/state", stream_of()),
-    "another vehicle": ("companion/rig/state", encode(state_of("other", SESSION))),
+    "another vehicle": ("companion/rig/state", to_json(state_of("other", SESSION))),
     "oversized": ("companion/rig/events", b" " * 200_001),
     "not a vehicle name": ("companion/<b>/stream", stream_of()),
     "a command": ("companion/rig/command", stream_of()),
@@ -92,7 +93,7 @@ def test_a_new_flight_has_a_clock_of_its_own_and_an_old_retained_state_does_not_
     watch = VehicleTracker()
     watch.receive("companion/rig/stream", stream_of(t_s=500.0), False, 100.0)
     watch.receive("companion/rig/stream", stream_of("s2", t_s=1.0), False, 101.0)
-    watch.receive("companion/rig/state", encode(state_of("rig", SESSION, presence=Presence.ENDED)), True, 101.0)
+    watch.receive("companion/rig/state", to_json(state_of("rig", SESSION, presence=Presence.ENDED)), True, 101.0)
     known = watch.vehicles["rig"]
     assert known.session == "s2"
     assert known.clock.now_ms(102.0) == pytest.approx(2000, abs=1)
@@ -105,8 +106,8 @@ def test_a_flood_of_vehicles_does_not_push_out_the_one_that_flies_or_is_proven(s
     watch, proven = VehicleTracker(signer=signer), with_proofs(flight()[1][30], "rig", [ANNA.key])
     for number in range(3 * VEHICLES_MAX):
         if signer is None or number == 0:
-            watch.receive("companion/rig/stream", encode(proven), False, number + 0.5)
-        watch.receive(f"companion/fake-{number}/state", encode(state_of(f"fake-{number}", "s")), True, number + 0.6)
+            watch.receive("companion/rig/stream", to_json(proven), False, number + 0.5)
+        watch.receive(f"companion/fake-{number}/state", to_json(state_of(f"fake-{number}", "s")), True, number + 0.6)
     assert len(watch.vehicles) == VEHICLES_MAX
     assert watch.vehicles["rig"].stream is not None
 
@@ -114,7 +115,7 @@ def test_a_flood_of_vehicles_does_not_push_out_the_one_that_flies_or_is_proven(s
 def test_vehicles_that_ended_or_were_lost_are_not_present() -> None:
     watch = VehicleTracker()
     for name, presence in (("flies", Presence.FLYING), ("over", Presence.ENDED), ("gone", Presence.LOST)):
-        watch.receive(f"companion/{name}/state", encode(state_of(name, SESSION, presence=presence)), True, 0.0)
+        watch.receive(f"companion/{name}/state", to_json(state_of(name, SESSION, presence=presence)), True, 0.0)
     watch.receive("companion/heard/stream", stream_of(), False, 0.0)
     assert watch.present(0.0) == ["flies", "heard"]
     assert watch.present(2 * LIVE_S) == ["flies"]
@@ -164,8 +165,8 @@ def test_a_few_huge_messages_fill_an_outbox() -> None:
 def test_a_late_viewer_gets_the_known_state_but_no_old_stream() -> None:
     watch = VehicleTracker()
     hub = Hub(watch, "no broker yet")
-    watch.receive("companion/rig/state", encode(state_of("rig", SESSION)), True, 0.0)
-    watch.receive("companion/rig/events", encode(Events(v=VERSION, session=SESSION, count=0, lines=())), True, 0.0)
+    watch.receive("companion/rig/state", to_json(state_of("rig", SESSION)), True, 0.0)
+    watch.receive("companion/rig/events", to_json(Events(v=VERSION, session=SESSION, count=0, lines=())), True, 0.0)
     watch.receive("companion/rig/stream", stream_of(), False, 10.0)
     soon, late = Outbox(), Outbox()
     hub.add(soon, 10.0 + 0.9 * FRESH_S)

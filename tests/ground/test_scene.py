@@ -8,9 +8,10 @@ import jsonschema
 import pytest
 
 from companion.config.loader import load_flight
-from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, Scene, Topic, decode, encode
+from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, Scene, Topic, decode
 from companion.ground.telemetry.scene import PATH_POINTS_MAX, scene_of
 from companion.mission.plan import Plan
+from companion.model.codec import to_json
 from companion.model.types import Vec3
 from tests.machines import overrides_with_joints
 from tests.support import CATCH, HOVER, tether_of
@@ -30,15 +31,15 @@ def test_the_scene_is_the_vehicle_file_and_the_mission() -> None:
     assert math.degrees(scene.tilt_abort_rad) == pytest.approx(vehicle.safety.tilt_abort_deg)
     assert scene.tracking_warn_m < scene.tracking_abort_m == vehicle.safety.tracking_error_abort_m
     assert (scene.path_world_m, scene.mission_s) == (((0.0, 1.0, 2.0),), 31.5)
-    assert decode(Scene, encode(scene)) == scene
+    assert decode(Scene, to_json(scene)) == scene
 
 
 def test_the_scene_of_a_vehicle_without_tether_and_net_has_no_anchor_and_no_net() -> None:
     absent = ["vehicle.tether=null", "vehicle.tool=null", "vehicle.devices.force=null"]
     scene = scene_of(load_flight(CATCH, overrides=absent), "s1")
     assert (scene.anchor_world_m, scene.tether_length_m, scene.net_radius_m) == (None, None, None)
-    assert decode(Scene, encode(scene)) == scene
-    jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(encode(scene)))
+    assert decode(Scene, to_json(scene)) == scene
+    jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(to_json(scene)))
 
 
 @pytest.mark.parametrize("count", [0, 1, 4])
@@ -46,8 +47,8 @@ def test_the_scene_has_as_many_links_and_limits_as_the_arm(count: int) -> None:
     config = load_flight(HOVER, overrides=overrides_with_joints(count))
     scene = scene_of(config, "s1")
     assert [len(values) for values in (scene.links_body_m, scene.joint_min_rad, scene.joint_max_rad)] == [count] * 3
-    assert decode(Scene, encode(scene)) == scene
-    jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(encode(scene)))
+    assert decode(Scene, to_json(scene)) == scene
+    jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(to_json(scene)))
 
 
 def test_phases_are_named_as_the_flight_names_them() -> None:
@@ -62,7 +63,7 @@ def test_a_long_path_is_thinned_out_evenly(count: int) -> None:
     scene = scene_of(load_flight(CATCH), "s", path)
     found = scene.path_world_m
     assert len(found) == min(count, PATH_POINTS_MAX)
-    assert len(encode(scene)) < MESSAGE_MAX_BYTES
+    assert len(to_json(scene)) < MESSAGE_MAX_BYTES
     if count:
         assert (found[0], found[-1]) == (path[0], path[-1])
         steps = {b[0] - a[0] for a, b in itertools.pairwise(found)}

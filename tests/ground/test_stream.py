@@ -21,10 +21,9 @@ from companion.ground.protocol.messages import (
     Stream,
     Topic,
     decode,
-    encode,
 )
 from companion.ground.telemetry.stream import TEXT_MAX, StreamBuilder, replay
-from companion.model.codec import Record
+from companion.model.codec import Record, to_json
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.markers import BallState
 from companion.model.outputs import ActiveRule, Outputs, Sent
@@ -94,8 +93,8 @@ def test_a_message_is_the_tick_that_it_is_made_of() -> None:
     assert stream.control.tau == pytest.approx(outputs.control.tau[0:3], abs=6e-5)
     assert stream.control.arm_torque_nm == pytest.approx(outputs.control.tau[6:8], abs=6e-5)
     assert not stream.waits_for_start and stream.ball is None
-    assert decode(Stream, encode(stream)) == stream
-    jsonschema.Draft202012Validator(schema_of(Topic.STREAM)).validate(json.loads(encode(stream)))
+    assert decode(Stream, to_json(stream)) == stream
+    jsonschema.Draft202012Validator(schema_of(Topic.STREAM)).validate(json.loads(to_json(stream)))
 
 
 def test_a_ball_is_shown_with_the_time_until_the_net_meets_it() -> None:
@@ -103,7 +102,7 @@ def test_a_ball_is_shown_with_the_time_until_the_net_meets_it() -> None:
     ball = BallState(position_world_m=(1.0, 2.0, 3.0), meeting_world_m=(0.5, 0.25, 1.0), meeting_s=t_s + 0.25)
     stream = stream_of(changed(IN_FLIGHT, outputs__ball=ball))
     assert stream.ball == BallView(position_world_m=(1.0, 2.0, 3.0), meeting_world_m=(0.5, 0.25, 1.0), meets_in_s=0.25)
-    assert decode(Stream, encode(stream)) == stream
+    assert decode(Stream, to_json(stream)) == stream
     late = stream_of(changed(IN_FLIGHT, outputs__ball=msgspec.structs.replace(ball, meeting_s=t_s - 0.1))).ball
     assert late is not None and late.meets_in_s == 0.0
 
@@ -193,7 +192,7 @@ def test_values_that_are_not_finite_make_a_message_that_every_parser_reads(bad: 
         raise AssertionError(text)
 
     for topic, record in ((Topic.STREAM, maker.build(1.7e9)), (Topic.EVENTS, maker.events_message())):
-        data = json.loads(encode(record), parse_constant=no_constants)
+        data = json.loads(to_json(record), parse_constant=no_constants)
         jsonschema.Draft202012Validator(schema_of(topic)).validate(data)
 
 
@@ -250,7 +249,7 @@ def test_the_newest_events_are_kept_and_all_are_counted() -> None:
     assert [line.id for line in record.lines] == [f"e{k}" for k in range(30, EVENTS_KEPT + 30)]
     assert record.lines[0].mission_t_s == pytest.approx(1.5)
     assert (record.lines[-1].severity, record.lines[-1].action) == ("warning", "hold")
-    assert decode(Events, encode(record)) == record
+    assert decode(Events, to_json(record)) == record
 
 
 def test_what_repeats_for_ever_pushes_no_event_out() -> None:
@@ -266,7 +265,7 @@ def test_the_longest_events_fit_into_a_message() -> None:
     maker = StreamBuilder(CONFIG, "s")
     for _ in range(EVENTS_KEPT):
         maker.add_line(1e5 / 3, "critical", "x" * 40, "\N{PILE OF POO}\x00" * TEXT_MAX)
-    assert len(encode(maker.events_message())) <= MESSAGE_MAX_BYTES
+    assert len(to_json(maker.events_message())) <= MESSAGE_MAX_BYTES
 
 
 def tether(**values: Any) -> dict[str, Any]:

@@ -25,12 +25,13 @@ from rich.console import Console
 
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.keys import operators_text, write_private
-from companion.ground.protocol.messages import Presence, TetherView, encode
+from companion.ground.protocol.messages import Presence, TetherView
 from companion.ground.protocol.proof import with_proofs
 from companion.ground.station.station import Station
 from companion.ground.station.text_monitor import _Screen
 from companion.ground.station.text_view import STALE_S, Notice, StationStatus, render, stale, status_line, status_word
 from companion.ground.station.vehicles import Vehicle, VehicleTracker
+from companion.model.codec import to_json
 from companion.model.types import OperatorCommand
 from tests.broker import Broker
 from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER
@@ -54,7 +55,7 @@ def known(presence: Presence = Presence.FLYING, heard_s: float = 0.0, event: str
         ("events", replace(events, session="s", lines=lines)),
         ("stream", replace(flight()[1][-1], session="s", **values)),
     ):
-        assert watch.receive(f"companion/rig/{topic}", encode(record), False, heard_s) is not None
+        assert watch.receive(f"companion/rig/{topic}", to_json(record), False, heard_s) is not None
     return watch.vehicles["rig"]
 
 
@@ -212,7 +213,7 @@ def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any]) -> None:
         stream = replace(
             flight()[1][-1], session=session, hold=hold, action="hold", wall_s=2e9 if session == "s2" else 1e9
         )
-        payload = encode(with_proofs(replace(stream, t_s=stream.t_s + hold), vehicle, [ANNA.key]))
+        payload = to_json(with_proofs(replace(stream, t_s=stream.t_s + hold), vehicle, [ANNA.key]))
         assert station.tracker.receive(f"companion/{vehicle}/stream", payload, False, time.monotonic()) is not None
         screen._chosen = vehicle
 

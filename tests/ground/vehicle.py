@@ -27,11 +27,11 @@ from companion.ground.protocol.messages import (
     State,
     Stream,
     Topic,
-    encode,
 )
 from companion.ground.protocol.proof import with_proof, with_proofs
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import STREAM_PERIOD_S, replay
+from companion.model.codec import to_json
 from companion.model.types import OperatorCommand
 from tests.analysis.synthetic_flight import synthetic_flight
 from tests.support import CATCH
@@ -110,7 +110,7 @@ class PlayedVehicle:
         return scene_of(config, self.session, [(0.0, 0.0, 1.0), (1.0, 0.0, 1.0)], mission_s=21.0)
 
     async def say(self, topic: Topic, record: object, *, retain: bool = False, qos: int = 1) -> None:
-        await self._client.publish(topic.of(self.name), encode(record), qos=qos, retain=retain)
+        await self._client.publish(topic.of(self.name), to_json(record), qos=qos, retain=retain)
         task = asyncio.current_task()
         if task is not None and task.cancelling():  # forgotten by wait_for of Python 3.11, if the answer came just then
             raise asyncio.CancelledError

@@ -20,7 +20,6 @@ from companion.mission.reference import (
     Move,
     Profile,
     Track,
-    at_rest,
     minimum_snap,
     rest_to_rest,
     slow_down,
@@ -28,6 +27,7 @@ from companion.mission.reference import (
     steady,
 )
 from companion.model.types import Joints, PhaseKind, Reference, Vec3
+from tests.control.states import at_rest
 from tests.support import tool_of
 
 ROOT = Path(__file__).parents[2]

@@ -21,7 +21,8 @@ from paho.mqtt.enums import CallbackAPIVersion
 from companion.config.loader import FlightConfig, load_flight
 from companion.ground.protocol.commands import make_command
 from companion.ground.protocol.keys import Operator, load_login, new_key, operators_text, write_private
-from companion.ground.protocol.messages import Stream, Topic, decode, encode, vehicle_of
+from companion.ground.protocol.messages import Stream, Topic, decode, vehicle_of
+from companion.model.codec import to_json
 from companion.model.outputs import Outputs, Sent
 from companion.model.types import Inputs, OperatorCommand
 from companion.recorder.client import RecorderProcess, RecorderReport
@@ -182,4 +183,4 @@ def command(
     listener: Listener, name: OperatorCommand, session: str, key: bytes = ANNA, vehicle: str = VEHICLE
 ) -> bytes:
     assert listener.t_s is not None
-    return encode(make_command(name, vehicle, session, "anna", key, round(listener.t_s * 1e3)))
+    return to_json(make_command(name, vehicle, session, "anna", key, round(listener.t_s * 1e3)))

@@ -25,7 +25,8 @@ from companion.config.loader import load_flight
 from companion.ground.broker import setup as broker_setup
 from companion.ground.protocol.commands import make_command
 from companion.ground.protocol.keys import load_operators, new_key, write_private
-from companion.ground.protocol.messages import Ack, Events, Presence, State, Topic, encode
+from companion.ground.protocol.messages import Ack, Events, Presence, State, Topic
+from companion.model.codec import to_json
 from companion.model.types import GroundCommand, OperatorCommand, SafetyAction
 from tests.broker import Broker, loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
@@ -84,7 +85,7 @@ def test_a_signed_command_reaches_the_flight_and_its_answer_comes_back(tmp_path:
 
 def garbage(seed: int, count: int, session: str) -> Iterator[bytes]:
     chance = random.Random(seed)
-    like = json.loads(encode(make_command(OperatorCommand.LAND, VEHICLE, session, "anna", new_key(), 5000)))
+    like = json.loads(to_json(make_command(OperatorCommand.LAND, VEHICLE, session, "anna", new_key(), 5000)))
     for k in range(count):
         match k % 5:
             case 0:
@@ -169,7 +170,7 @@ def test_a_full_disk_costs_the_log_and_neither_a_command_nor_its_answer(tmp_path
 def test_a_command_that_the_broker_kept_is_refused(tmp_path: Path, broker: Broker) -> None:
     with Listener(broker.port) as listener:
         kept = make_command(OperatorCommand.LAND, VEHICLE, "before", "anna", bytes(32), 0)
-        listener.publish(Topic.COMMAND.of(VEHICLE), encode(kept), retain=True)
+        listener.publish(Topic.COMMAND.of(VEHICLE), to_json(kept), retain=True)
         with flight_with(tmp_path, broker.url) as flight:
             flight.fly(100)
             listener.wait(Topic.STATE, State, lambda state: state.commands)

@@ -14,11 +14,11 @@ from msgspec.structs import replace
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.mission.plan import Plan
-from companion.mission.reference import at_rest
 from companion.model.algebra import plus
 from companion.model.outputs import TetherState
 from companion.model.types import Reference, Vec3
 from companion.safety.governor import Governed, Governor, SafeSet, _share_within
+from tests.control.states import at_rest
 from tests.safety.healthy import SLOW
 from tests.support import tether_of
 

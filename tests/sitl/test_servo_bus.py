@@ -217,7 +217,7 @@ async def test_bus_survives_a_master_that_never_reads() -> None:
                 await asyncio.sleep(0)
             os.set_blocking(master.fd, True)
             termios.tcflush(master.fd, termios.TCIOFLUSH)
-            bus.line.drop_partial()
+            bus.line.parser.drop_partial()
             master.send(_PING)
             await master.receive(len(status(1, 0, b"abc")))
 

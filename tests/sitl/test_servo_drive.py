@@ -40,7 +40,7 @@ def test_alone_and_behind_the_control_table_it_is_the_same_servo(
         assert drive.present() == struct.unpack("<hii", servo.read(126, 10))
         assert drive.watchdog_tripped == (servo.read(98, 1) == b"\xff")
         if goal is not None and not drive.watchdog_tripped:
-            for one in (drive, servo):
+            for one in (drive, servo.drive):
                 one.heard_instruction()
             servo.write(102, struct.pack("<h", goal))
             drive.set_goal_current(goal)

@@ -150,7 +150,6 @@ class Pairs:
     """Flights of two variants in the same laboratories, with the same payload and model error."""
 
     group: Group
-    """The variant that is compared."""
     base_m_this_m: Sequence[tuple[float, float]]
     """RMS of ||e_p|| after the catch in m, first with the variant compared with, then with this one; infinite if the flight failed.
     Pairs with two failures or a missed payload are left out.
@@ -193,9 +192,7 @@ def adaptation_pairs(groups: Sequence[Group]) -> list[Pairs]:
 
 
 def pairs_with_reference(groups: Sequence[Group]) -> dict[int, Pairs]:
-    """Return, by `id` of each other group, its pairs with the adaptive law's `recommended`, or with the first variant if that was not
-    flown.
-    """
+    """Return, by `id` of each other group, its pairs with the adaptive law's `recommended`, or else with the first variant."""
     labels = [group.label for group in groups]
     label = REFERENCE if REFERENCE in labels else next(iter(labels), "")
     base = [group for group in groups if group.label == label]

@@ -55,7 +55,6 @@ class Variant:
     preset: str
     """Name in the table: a preset, or a preset and the part that is removed from it."""
     base_preset: str
-    """The preset to load."""
     overrides: tuple[str, ...] = ()
 
     @property

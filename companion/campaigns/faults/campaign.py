@@ -104,9 +104,7 @@ def extreme(rows: Sequence[Row], key: str, pick: Callable[[list[float]], float])
 
 
 def shown_size(row: Row) -> str:
-    """Return a fault's size with its unit, followed by its duration if it has one that is not the size itself; empty if the fault has
-    no size.
-    """
+    """Return a fault's size with its unit, and its duration if that is not the size itself; empty if the fault has no size."""
     if row["size"] is None:
         return ""
     text = f"{row['size']:g} {row['unit']}".strip()
@@ -123,7 +121,6 @@ def flights_table(rows: Sequence[Row], *, details: bool = False) -> Table:
     """Return a table with one line per flight.
 
     Args:
-        rows: rows of the flights.
         details: whether to add a column with problems and events.
     """
 

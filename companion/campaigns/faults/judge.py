@@ -76,7 +76,6 @@ class FaultFlight:
     course: Sequence[Point]
     ticks: Sequence[Tick]
     events: Sequence[Event]
-    """Events of the core and of the guardian."""
     landed: bool
     """Whether the vehicle ended on the floor with its rotors stopped."""
     caught: bool

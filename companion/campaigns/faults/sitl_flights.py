@@ -43,7 +43,6 @@ class WireFlights:
 
     Args:
         options: arguments of `companion fly` that all flights share, the mission first.
-        config: effective configuration, for the evaluation.
         out: folder in which every flight gets a folder of its own.
     """
 

@@ -28,7 +28,6 @@ class Robustness(Campaign):
     mission: str
     """Mission file as named by the user."""
     seed: int
-    """Seed of the draws."""
     cases: Sequence[Case] = ()
     """The cases to fly; empty to fly draws."""
     cases_file: str | None = None

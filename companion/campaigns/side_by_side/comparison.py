@@ -33,7 +33,6 @@ class Figure:
     digits: int
     values: tuple[float | None, ...]
     differences: tuple[float | None, ...]
-    """Differences from the first flight."""
     verdicts: tuple[str | None, ...]
     """`better` or `worse` than the first flight, for metrics for which a smaller value is certainly better."""
 
@@ -54,7 +53,6 @@ class Comparison:
     about: tuple[tuple[str, tuple[str, ...]], ...]
     """Facts about the flights: the name of each fact and its text for each flight."""
     settings: tuple[Setting, ...]
-    """Settings that differ."""
     addresses: tuple[Setting, ...]
     """Differing addresses of simulated devices, which the simulated world chooses for each flight."""
     figures: tuple[Figure, ...]

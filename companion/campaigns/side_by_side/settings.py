@@ -45,9 +45,7 @@ class Setting:
 
 
 def simulated(config: dict[str, Any]) -> bool:
-    """Return whether the flight was simulated: if so, its arm is on a pseudo-terminal or, without an arm, motion capture is on this
-    computer.
-    """
+    """Return whether the flight was simulated: its arm is on a pseudo-terminal or, without an arm, its mocap on this computer."""
     devices = _part(_part(config, "vehicle"), "devices")
     port = _part(devices, "arm").get("port")
     if port is None:

@@ -76,12 +76,7 @@ class Draws:
 def draws_of(
     mission: Mission, vehicle: Vehicle, overrides: Sequence[str], seed: int, training: int, held_out: int
 ) -> tuple[Draws, Draws]:
-    """Return the laboratories of the search, whose flights end some seconds after the catch, and the held-out ones.
-
-    Args:
-        seed: seed of the search, 1 or more.
-        held_out: number of held-out laboratories.
-    """
+    """Return the laboratories of the search, whose flights end some seconds after the catch, and the held-out ones."""
     plan = Plan.build(mission, vehicle)
     payload_kg = mission.catch.payload_max_kg if mission.catch is not None else None
     fixed = frozenset(key for override in overrides if (key := world_key(override)))

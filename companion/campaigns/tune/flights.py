@@ -45,7 +45,6 @@ class Flights(AbstractContextManager["Flights"]):
         self._bar = progress_bar()
         self._task = self._bar.add_task("", total=total)
         self.flown: list[Message] = []
-        """Results of the flights that were flown now."""
         if self._path is not None:
             self._open(self._path, settings)
 

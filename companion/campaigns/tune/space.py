@@ -25,12 +25,10 @@ class Axis:
 
     gain: TunedGain
     low: float
-    """Smallest factor."""
     high: float
     name: str
     """Key, with the range of its values if they are not all."""
     start: float
-    """First of the values at the start."""
 
     @property
     def at_start(self) -> float:

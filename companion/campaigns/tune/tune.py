@@ -53,9 +53,7 @@ class Tune:
     training: int
     """Number of laboratories of the search."""
     held_out: int
-    """Number of held-out laboratories."""
     command: str
-    """The command line, for the record."""
     fly: str
     """The command line that flies the gains, without the option for the controller file."""
     overrides: Sequence[str] = ()

@@ -56,9 +56,7 @@ class PingAnswers:
 
 
 class ServoTalk(ServoAccess):
-    """Communication on one port. Every failure of the port is a DeviceError. A KeyboardInterrupt in any method leaves no servo under
-    torque.
-    """
+    """Communication on one port, whose every failure is a DeviceError. A KeyboardInterrupt leaves no servo under torque."""
 
     def __init__(self, port: str) -> None:
         self.port: _CountingPort

@@ -84,7 +84,6 @@ class FrictionFit:
     joint_friction_nm: Estimate | None
     """Mean of all joints; None if the data do not determine it."""
     notes: tuple[str, ...]
-    """Remarks, one line each."""
 
     @property
     def torque_per_amp_nm_a(self) -> Estimate | None:
@@ -124,7 +123,6 @@ def fit(samples: Sequence[Sample], vehicle: Vehicle) -> FrictionFit:
 
     Args:
         samples: sweeps of all joints in both directions, at two speeds or more.
-        vehicle: masses, lengths, and the torque constants and friction to compare with.
     """
     count = len(vehicle.arm.joints)
     fits = tuple(fit_joint([one for one in samples if one.joint == joint], vehicle, joint) for joint in range(count))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 from companion.commissioning.arm import bus
@@ -35,7 +34,6 @@ from companion.model.servos import hardware_error_text, kind_of, model_text
 from companion.preflight import arm as preflight
 from companion.preflight.checks import Check
 
-SYSFS: Final = Path("/sys/class/tty")
 SEARCHED: tuple[int, ...] = tuple(reversed(bus.BAUDS))
 """Baud rates of a full scan, in this order, after the vehicle file's rate."""
 
@@ -76,9 +74,7 @@ def scan_for(session: Session, only: int | None = None) -> Scan:
         return scan(device, progress=lambda text: status.update(f"searching for servos at {text}"), only=only)
 
 
-def scan(
-    device: ArmDevice, *, progress: Callable[[str], None] = lambda _: None, sysfs: Path = SYSFS, only: int | None = None
-) -> Scan:
+def scan(device: ArmDevice, *, progress: Callable[[str], None] = lambda _: None, only: int | None = None) -> Scan:
     """Ping at every baud rate and read the registers of every servo that answers. Nothing is written; torque stays off.
 
     Args:
@@ -105,7 +101,7 @@ def scan(
             unreadable = any(kind_of(one.model) is not None and not one.registers for one in found)
             if answers.garbled or unreadable:
                 garbled.append(baud)
-    return Scan(tuple(tried), tuple(servos), tuple(garbled), usb_latency_ms(device.port, sysfs))
+    return Scan(tuple(tried), tuple(servos), tuple(garbled), usb_latency_ms(device.port))
 
 
 def _read(talk: ServoTalk, servo_id: int, model: int, firmware: int) -> FoundServo:
@@ -262,7 +258,6 @@ def _each(servos: Sequence[FoundServo], texts: Sequence[str]) -> str:
 
 
 def _found(found: Scan, judged: Judgement) -> list[dict[str, Any]]:
-    """Return the data of each servo, with the number of its joint."""
     joints = {id(servo): index + 1 for index, servo in enumerate(judged.assignment.joints) if servo is not None}
     return [{**servo.as_json(), "joint": joints.get(id(servo))} for servo in found.servos]
 

@@ -139,9 +139,7 @@ class Setting(NamedTuple):
 
 
 def settings(servo: FoundServo, index: int, arm: Arm, device: ArmDevice) -> list[Setting]:
-    """Return every setting that the companion needs, in the order of writing: id and baud rate come last because they change the
-    address.
-    """
+    """Return every setting that the companion needs, in the order of writing: id and baud rate last, as they change the address."""
     joint = arm.joints[index]
     kind = joint.kind
     needed = math.floor(joint.torque_max_nm / (arm.torque_constants_nm_a[index] * kind.current_unit_a) + 1e-9)

@@ -139,7 +139,6 @@ def carry_out(port: str, plans: Sequence[ServoPlan], report: Callable[[str], Non
     """Write the planned settings to one servo after the other.
 
     Args:
-        plans: plans from one scan.
         report: called with a line for each value that is written.
 
     Raises:
@@ -187,7 +186,6 @@ class Done:
     plan: SetupPlan
     outcome: str
     text: tuple[str, ...]
-    """Remarks, one line each."""
     right: bool
     """Whether every servo has the required settings."""
 

@@ -111,7 +111,6 @@ class Sweeper:
     """Leader that moves the arm through the legs and keeps the samples for the fit.
 
     Args:
-        legs: legs in order.
         torque_constants_nm_a: the constant of each joint by which the arm's driver converts currents to torques.
     """
 

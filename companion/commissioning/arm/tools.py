@@ -28,7 +28,6 @@ from companion.runtime.terminal import Bars, pressed, raw_keys
 
 
 def _stand_text(vehicle: Vehicle) -> str:
-    """Return how to place the vehicle so that the arm can hang freely."""
     arm = vehicle.arm
     below_m = vehicle.reach_m + vehicle.tip_radius_m - arm.first_joint_body_m[2]
     text = f"the arm reaches {below_m:.2f} m below the body"

@@ -142,7 +142,6 @@ class ZeroGuide:
         return self._conclude(moved)
 
     def _still_s(self, t_s: float) -> float:
-        """Return how long all joints have been at rest, s."""
         newest = self._window[-1][1]
         low, high = list(newest), list(newest)
         since_s = t_s

@@ -13,11 +13,9 @@ import msgspec
 
 from companion.commissioning.force_torque import fit as ft_fit
 from companion.commissioning.force_torque.watch import (
-    FtSensor,
     arm_angles,
     force_device,
     pose_rad,
-    sensor_of,
     tool_of,
     until_loaded,
 )
@@ -26,6 +24,8 @@ from companion.config.device_plugins import RFT60
 from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
 from companion.io.dynamixel.port import usb_latency_ms
+from companion.io.force_torque.driver import RobotousForceTorque
+from companion.io.force_torque.plugin_driver import open_force
 from companion.io.protocols import DeviceError
 from companion.model.check_row import Row
 from companion.model.constants import GRAVITY_M_S2
@@ -76,7 +76,7 @@ async def watch(session: Session) -> Watched:
     vehicle, weight_kg = session.vehicle, session.arguments.weight
     clock, device = flight_clock(), force_device(vehicle)
     given_rad = pose_rad(session.arguments.arm_pose, vehicle)
-    async with sensor_of(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
+    async with open_force(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
         session.say(f"force sensor: {device.port or device.type}; {_EMPTY} for {WATCH_S:g} s")
         empty = await sensor.tare_samples(WATCH_S)
         health = sensor.counts()
@@ -186,8 +186,8 @@ async def watch_drift(session: Session) -> Tared:
         if wanted and not session.confirm(question):
             raise Cancelled("nothing was written to the sensor")
     clock = flight_clock()
-    async with sensor_of(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
-        if arguments.clear and isinstance(sensor, FtSensor):
+    async with open_force(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
+        if arguments.clear and isinstance(sensor, RobotousForceTorque):
             await sensor.set_bias(False)
         session.say(f"force sensor: {device.port or device.type}; {_EMPTY} for {arguments.seconds:g} s")
         first = await sensor.tare_samples(TARE_S)
@@ -195,7 +195,7 @@ async def watch_drift(session: Session) -> Tared:
         while samples[-1].stamp_s - samples[0].stamp_s < arguments.seconds:
             samples += await sensor.tare_samples(TARE_S)
         seen = Tared(samples, first, await angles_rad())
-        if not (arguments.sensor and isinstance(sensor, FtSensor)):
+        if not (arguments.sensor and isinstance(sensor, RobotousForceTorque)):
             return seen
         await sensor.set_bias(True)
         return replace(seen, zeroed=await sensor.tare_samples(TARE_S))

@@ -11,14 +11,10 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Final
 
 from companion.config.arm import Tool
-from companion.config.device_plugins import RFT60
 from companion.config.devices import ForceDevice
 from companion.config.document import ConfigError
 from companion.config.vehicle import Vehicle
 from companion.io.devices import open_arm
-from companion.io.force_torque.driver import RobotousForceTorque
-from companion.io.force_torque.plugin_driver import PluginForceTorque
-from companion.io.force_torque.rft import Command
 from companion.io.force_torque.samples import SampleStream
 from companion.io.protocols import DeviceError
 from companion.model.types import Joints, Vec3
@@ -26,7 +22,6 @@ from companion.preflight.force import mean_force_n
 from companion.runtime.clock import Clock
 
 WEIGHT_TIMEOUT_S: Final = 90.0
-_ON_THEIR_WAY_S: Final = 0.2
 _LOOK_S: Final = 0.5
 _STILL_S: Final = 1.5
 _STILL_N: Final = 0.3
@@ -34,26 +29,6 @@ _STILL_N: Final = 0.3
 _CHANGE_MIN_N: Final = 0.5
 _CHANGE_SHARE: Final = 0.15
 """Fraction of the expected weight from which a change counts as the weight; low enough for a sensor that reads too little."""
-
-
-class FtSensor(RobotousForceTorque):
-    """The force sensor's driver with SET_BIAS, which no flight uses."""
-
-    async def set_bias(self, on: bool) -> None:
-        """Set the sensor's zero to the current reading (SET_BIAS 1) or clear it (0), and drop the samples in transit.
-
-        The sensor does not acknowledge the command; check its reading.
-
-        Raises:
-            DeviceError: the sensor stopped sending.
-        """
-        self._send(Command.SET_BIAS, int(on))
-        await self.tare_samples(_ON_THEIR_WAY_S)
-
-
-def sensor_of(device: ForceDevice, clock: Clock) -> FtSensor | PluginForceTorque:
-    """Return the driver of the force sensor, with SET_BIAS if it is the built-in one."""
-    return (FtSensor if device.type == RFT60 else PluginForceTorque)(device, clock)
 
 
 def force_device(vehicle: Vehicle) -> ForceDevice:

@@ -79,10 +79,7 @@ _PRIORS = (_ANGLE_GAIN_LN, _RATE_GAIN_LN, _ROTOR_LAG_LN, _DELAY)
 
 
 def _transfer(p: Array, s: Spectrum) -> Spectrum:
-    """Return the response of PX4's cascade: angle gain, rate loop (PID, derivative of the measured rate) and rotors, after a delay.
-
-    The parameters are the logarithms of both gains and of the rotors' lag, and the delay.
-    """
+    """Return the response of PX4's cascade. Parameters: logarithms of angle gain, rate gain and rotors' lag; the delay."""
     angle_1_s, rate_1_s, lag_s = np.exp(p[:3])
     rotors = rate_1_s * np.exp(-_MEASURED_S * s) / (1.0 + lag_s * s)
     forward = (s + _INTEGRAL_1_S) * rotors

@@ -112,8 +112,6 @@ def fit_response(
     """Fit the parameters of a response.
 
     Args:
-        pieces: parts of the flight.
-        transfer: the model.
         starts: first guesses; the best result counts, because the cost may have several minima.
         priors: one for each parameter.
         bounds: lower and upper bounds of the parameters.

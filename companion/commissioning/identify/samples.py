@@ -36,7 +36,6 @@ class Flight:
 
     log: FlightLog
     vehicle: Vehicle
-    """The vehicle file as it was flown."""
     airborne: tuple[tuple[int, int], ...]
     """First and last tick (exclusive) of each uninterrupted part in which only the rotors carry the vehicle and the companion controls
     it, without the impact of a catch and without contact.

@@ -123,9 +123,7 @@ def _refuse_armed(link: LatencyLink, address: str) -> None:
 
 
 async def _tapped(session: Session, link: LatencyLink, clock: Clock, poses: list[MocapPose]) -> tuple[TapDelay, ...]:
-    """Return all taps once enough are usable or time is up. During the session taps are only counted, because computing on
-    the event loop would delay the time stamps of motion capture.
-    """
+    """Return all taps once enough are usable or time is up; meanwhile only count: computing would delay mocap's stamps."""
     end_s, from_s, wanted = clock() + session.arguments.seconds, clock(), session.arguments.taps
     done: list[TapDelay] = []
     missing = wanted
@@ -166,7 +164,6 @@ async def _count(
 
 
 def _max_ms(vehicle: Vehicle) -> float:
-    """Return the largest delay that the preflight accepts."""
     limits = next(one.limits_for(vehicle) for one in WANTED if one.name == PARAMETER)
     return math.inf if limits is None else limits[1]
 

@@ -114,9 +114,7 @@ class Timing:
 
 
 def timing(frames: Sequence[FrameSeen]) -> Timing | None:
-    """Return the regularity of the arrivals, from a least-squares fit of arrival time over frame number; None if there are fewer
-    than 10 frames or the frame number does not advance.
-    """
+    """Return the regularity of arrivals, by a fit of arrival time over frame number; None for fewer than 10 or repeated frames."""
     if len(frames) < 10 or frames[-1].number <= frames[0].number:
         return None
     n = [frame.number - frames[0].number for frame in frames]
@@ -179,7 +177,6 @@ class Watched:
     """Recording of a stream."""
 
     frames: Sequence[FrameSeen]
-    """Frames in order of arrival."""
     names: Mapping[int, str]
     """Names of the rigid bodies, by id."""
     info: ServerInfo
@@ -345,7 +342,6 @@ def text(watched: Watched) -> list[str]:
 
 
 def _marker_counts(frames: Sequence[FrameSeen]) -> tuple[int, int]:
-    """Return the smallest and largest number of single markers in a frame."""
     counts = [len(frame.markers.markers) for frame in frames if frame.markers is not None] or [0]
     return min(counts), max(counts)
 

@@ -16,7 +16,6 @@ from companion.ground.protocol.messages import MESSAGE_MAX_BYTES, Topic, vehicle
 from companion.runtime.tasks import until_first
 
 ANSWER_S = 5.0
-"""Timeout for each answer of the broker."""
 
 
 class CheckError(Exception):
@@ -42,7 +41,6 @@ class CheckResult:
     certificate_ends: str | None
     rights: tuple[TopicRights, ...]
     vehicles: tuple[str, ...]
-    """Vehicles with a retained message."""
 
 
 def check(access: BrokerAccess, vehicle: str | None = None) -> CheckResult:
@@ -111,11 +109,7 @@ async def _try_topics(access: BrokerAccess, name: str) -> tuple[set[Topic], set[
 
 
 def _probe(access: BrokerAccess) -> tuple[str | None, str | None]:
-    """Return the TLS version and the expiry of the broker's certificate, both None without TLS; opens a separate connection.
-
-    Raises:
-        CheckError: no connection.
-    """
+    """Return the broker's TLS version and certificate expiry, both None without TLS, by a connection of its own; raises CheckError."""
     address = access.address
     try:
         with socket.create_connection((address.host, address.port), ANSWER_S) as plain:

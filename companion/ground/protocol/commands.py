@@ -87,9 +87,7 @@ class Refused:
     text: str
     """One printable line for the operator; may quote the payload."""
     command: Command | None = None
-    """The command if its signature is valid and an `Ack` is to be sent. None if the sender is unknown, the command is a copy of an
-    answered one, or the limit `ACKS_PER_S` is reached.
-    """
+    """The command if signed and to be answered by an `Ack`: not from an unknown sender, not a copy, below `ACKS_PER_S`."""
 
 
 Verdict: TypeAlias = Accepted | Refused
@@ -122,7 +120,7 @@ def sign(command: Command, key: bytes) -> Command:
 def make_command(
     name: OperatorCommand, vehicle: str, session: str, operator: str, key: bytes, t_ms: int, hold: int = 0
 ) -> Command:
-    """Return a signed command with a new nonce; `companion.ground.protocol.messages.encode` makes the payload.
+    """Return a signed command with a new nonce; `companion.model.codec.to_json` makes the payload.
 
     Args:
         session: `State.session` or `Stream.session` of the flight.
@@ -220,9 +218,7 @@ class _History:
 
 
 class Verifier:
-    """Verifies messages of the vehicle's ``command`` topic. No I/O and no clock; it keeps a history of the commands that it has
-    verified.
-    """
+    """Verifies messages of the vehicle's ``command`` topic, of which it keeps a history. No I/O and no clock."""
 
     def __init__(self, operators: Operators, vehicle: str, session: str) -> None:
         self.operators = operators
@@ -341,5 +337,4 @@ def _parsed(payload: bytes) -> Command | Refused:
 
 
 def _shown(text: str) -> str:
-    """Return the text shortened and without unprintable characters."""
     return text.encode("ascii", "backslashreplace").decode("ascii")[:_TEXT_MAX]

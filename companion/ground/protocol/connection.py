@@ -37,7 +37,6 @@ class Connection(aiomqtt.Client):
     Args:
         identifier: client id; a new connection with the same id ends the previous one at the broker.
         packet_max_bytes: Maximum Packet Size; the broker drops larger messages.
-        answer_s: timeout for each answer of the broker.
         will: message that the broker publishes if the connection breaks.
         send_buffer_bytes: size of the socket's send buffer, whose content becomes stale if the broker is slow.
     """

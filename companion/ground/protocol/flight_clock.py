@@ -25,7 +25,6 @@ class FlightClock:
         """Add the time of one message.
 
         Args:
-            t_s: flight clock.
             monotonic_s: local monotonic clock at receipt, s.
         """
         self._newest_s = max(self._newest_s, t_s)
@@ -38,9 +37,7 @@ class FlightClock:
             samples.popleft()
 
     def now_s(self, monotonic_s: float, simulated: bool = False) -> float | None:
-        """Return the current flight clock, s; None before the first message. The clock continues while the vehicle is silent, unless
-        the vehicle is simulated.
-        """
+        """Return the flight clock, s, None before the first message; it goes on in silence, unless the vehicle is simulated."""
         if not self._samples:
             return None
         return self._newest_s if simulated else monotonic_s + self._samples[0][1]

@@ -24,7 +24,7 @@ from enum import Enum
 from typing import TypeVar
 
 from companion.ground.protocol.strict_json import StrictJsonError, parse
-from companion.model.codec import Record, RecordError, from_jsonable, to_json
+from companion.model.codec import Record, RecordError, from_jsonable
 from companion.model.types import Event, Joints, OperatorCommand, Quat, Vec3, Vec4
 
 VERSION = 2
@@ -261,9 +261,7 @@ class Timing(Record, frozen=True, kw_only=True):
 
 
 class Stream(Record, frozen=True, kw_only=True):
-    """Message on topic ``stream``, published at 20 Hz. Position and attitude come from motion capture, or from PX4 while motion
-    capture is lost.
-    """
+    """Message on topic ``stream``, published at 20 Hz, with the pose from motion capture, or from PX4 while that is lost."""
 
     v: int
     session: str
@@ -359,11 +357,6 @@ RECORDS: dict[Topic, type] = {
     Topic.ACK: Ack,
 }
 RETAINED = frozenset({Topic.STATE, Topic.SCENE, Topic.PREFLIGHT, Topic.EVENTS})
-
-
-def encode(message: object) -> bytes:
-    """Return a record as a payload."""
-    return to_json(message)
 
 
 def decode(cls: type[M], payload: bytes) -> M:

@@ -56,9 +56,7 @@ def ack_proven(ack: Ack, vehicle: str, key: bytes) -> bool:
 
 
 def _text(domain: str, vehicle: str, record: Stream | Ack) -> bytes:
-    """Return the proven text. Its JSON has the form that `json.dumps` writes. That form is part of the protocol, whatever codec
-    encodes the message.
-    """
+    """Return the proven text: the protocol fixes its JSON form, that of `json.dumps`, whatever codec encodes the message."""
     message = json.dumps(to_jsonable(record), allow_nan=False, separators=(",", ":"))
     return f"{domain}\n{vehicle}\n{message}\n".encode()
 

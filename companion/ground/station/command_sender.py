@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from companion.ground.protocol.access import BrokerAccess
 from companion.ground.protocol.commands import make_command
 from companion.ground.protocol.keys import default_operators_file, load_operators
-from companion.ground.protocol.messages import Ack, Topic, encode
+from companion.ground.protocol.messages import Ack, Topic
 from companion.ground.protocol.proof import Signer
 from companion.ground.station.link import Link, LinkError
 from companion.ground.station.vehicles import Vehicle, VehicleTracker
+from companion.model.codec import to_json
 from companion.model.commands import SAFER_COMMANDS
 from companion.model.types import OperatorCommand
 
@@ -181,7 +182,7 @@ class CommandSender:
         try:
             async with asyncio.timeout(ANSWER_S):
                 try:
-                    await self._link.publish(Topic.COMMAND.of(vehicle), encode(signed))
+                    await self._link.publish(Topic.COMMAND.of(vehicle), to_json(signed))
                 except LinkError as error:
                     problem = f"{error}; {FALLBACK_ADVICE}"
                 await asyncio.shield(answer)  # an earlier attempt may still be answered

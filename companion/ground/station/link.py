@@ -14,7 +14,6 @@ from companion.ground.protocol.connection import Connection, OnMessage, error_te
 from companion.ground.protocol.messages import MESSAGE_MAX_BYTES
 
 ANSWER_S = 2.0
-"""Timeout for each answer of the broker."""
 _PAUSE_MIN_S, _PAUSE_MAX_S = 0.2, 2.0
 _TOPIC_ROOM_BYTES = 1024
 _PERMANENT_REASON_CODES = frozenset({128, 132, 133, 134, 135, 138, 140, 144, 149, 156, 157})

@@ -48,9 +48,7 @@ class ReceivedRecord:
 
 @dataclass(slots=True)
 class ProvenState:
-    """State from stream messages with a valid proof, used for new commands: session, flight clock and hold. Only `VehicleTracker`
-    changes it.
-    """
+    """State from stream messages with a valid proof, for new commands: session, clock and hold. `VehicleTracker` changes it."""
 
     session: str
     wall_s: float
@@ -126,7 +124,6 @@ class VehicleTracker:
         self._signer = signer
         self.vehicles: dict[str, Vehicle] = {}
         self.rejected = 0
-        """Number of rejected messages."""
         self.rejected_text: str | None = None
         """Topic and error of the last rejected message."""
 

@@ -85,7 +85,6 @@ class Monitor:
     Args:
         hub: distributes messages to viewers; None for a replay.
         commands: sends commands; None for a replay.
-        replay_logs: the logs of a replay.
     """
 
     def __init__(

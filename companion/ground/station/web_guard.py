@@ -25,9 +25,7 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""Headers of every response."""
 MESSAGE_MAX_BYTES = 1024
-"""Largest message from a page."""
 MESSAGES_PER_S, MESSAGES_BURST = 10.0, 20
 _HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
 
@@ -54,7 +52,6 @@ def host_allowed(host_header: str | None, listens_on: str) -> bool:
     """Return whether a Host header names this server; a loopback name or address always does.
 
     Args:
-        host_header: received Host header.
         listens_on: value of --host. With 0.0.0.0 or ::, any IP address and this computer's own name are also allowed. This still stops
             DNS rebinding, because the browser then sends the host name of the attacker's page.
     """

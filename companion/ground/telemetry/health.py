@@ -56,7 +56,6 @@ class Snapshot:
     """Values from which the health is evaluated."""
 
     inputs: Inputs
-    """Inputs of the newest tick."""
     outputs: Outputs
     ages: WorstAges
     """Largest ages of the last second."""

@@ -71,9 +71,7 @@ class StreamBuilder:
         self._missed = 0
         self._seq = 0
         self.events: deque[EventLine] = deque(maxlen=EVENTS_KEPT)
-        """The newest events, oldest first."""
         self.count = 0
-        """Number of all events."""
 
     @property
     def newest_outputs(self) -> Outputs | None:
@@ -224,7 +222,6 @@ def replay(
 
     Args:
         rows: ticks in order, such as `companion.analysis.log.FlightLog.rows()` returns.
-        session: any session id.
         epoch_offset_s: wall clock when the flight clock was zero.
         max_records: maximum number of messages, at least 2.
 

@@ -30,11 +30,6 @@ class PluginArm(ThreadedArm[tuple[MotorState, ...], Joints]):
     """The motors of a plug-in behind the `Arm` protocol.
 
     Joint angles, directions, whole turns and torque limits are those of the vehicle file, applied here.
-
-    Args:
-        device: `devices.arm` of the vehicle file.
-        arm: joints of the vehicle file.
-        clock: the flight clock, source of all stamps.
     """
 
     def __init__(self, device: ArmDevice, arm: Arm, clock: Clock) -> None:
@@ -94,7 +89,6 @@ class PluginArm(ThreadedArm[tuple[MotorState, ...], Joints]):
         self._statement = ArmStatement(product, f"{watchdog}, after {watchdog_ms:g} ms")
 
     def _trial_s(self) -> float:
-        """Return the duration of one cycle with torque 0."""
         began_s = time.monotonic()
         self._write_bus(self._limp)
         self._read_bus()

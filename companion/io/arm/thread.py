@@ -62,9 +62,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
 
     Args:
         where: device and address, for errors.
-        watchdog_ms: timeout of the watchdogs.
         limp: goal without torque.
-        clock: the flight clock, source of all stamps.
     """
 
     writes_at_once: ClassVar[bool] = False
@@ -83,7 +81,8 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         self._state: ArmState | None = None
         self._failures = 0
         self._written_s: float | None = None
-        self._problem = ""
+        self.problem = ""
+        """Newest error of the port; empty if it has not failed."""
         self._servos: tuple[ServoReport, ...] = ()
         self._thread = DeviceThread("arm-bus", self._open, self._serve, self._close_bus, lambda: self._jobs.put(_STOP))
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -122,11 +121,6 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
 
     def command_clamp(self, command: ClampCommand | None) -> None:
         """Command the clamp, which keeps the last command; without one nothing happens. Never waits."""
-
-    @property
-    def problem(self) -> str:
-        """Return the newest error of the port; empty if it has not failed."""
-        return self._problem
 
     @property
     def read_takes_s(self) -> float:
@@ -204,7 +198,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
             return error
         except Exception as error:  # an unplugged port raises any exception of its driver; preflight needs one line
             return DeviceError(f"{self._where}: failed while being set up: {_describe(error)}")
-        found = self._problem or "the servos stopped answering right after set-up; check the cables"
+        found = self.problem or "the servos stopped answering right after set-up; check the cables"
         return DeviceError(f"{self._where}: {found}")
 
     def _serve(self) -> None:
@@ -268,7 +262,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         try:
             answer = self._read_bus()
         except Exception as error:  # as in `_try`
-            self._problem = _describe(error)
+            self.problem = _describe(error)
             answer = None
         if answer is None:
             self._failures += 1
@@ -287,17 +281,13 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         try:
             transaction()
         except Exception as error:
-            self._problem = _describe(error)
+            self.problem = _describe(error)
 
     # --- bus ---------------------------------------------------------------------------------------------------------
 
     @abstractmethod
     def _open_bus(self) -> None:
-        """Open the bus, check the arm and switch its torque on, with torque 0.
-
-        Raises:
-            DeviceError: the arm does not meet the requirements.
-        """
+        """Open the bus, check the arm and switch its torque on, with torque 0; raises DeviceError if it fails a requirement."""
 
     @abstractmethod
     def _read_bus(self) -> Answer | None:

@@ -134,5 +134,4 @@ class ServoAccess:
 
 
 def _arrived(result: int, error: int) -> bool:
-    """Return whether request and answer arrived intact."""
     return bool(result == COMM_SUCCESS and error & ERROR_NUMBER != _CRC_ERROR)

@@ -19,12 +19,6 @@ class DynamixelArm(ThreadedArm[tuple[Block, ...], Counts]):
 
     A tripped bus watchdog is restarted and reported once as `WATCHDOG_ERROR` in `ArmState.hardware_error`; a servo with a hardware
     error of its own is not restarted.
-
-    Args:
-        device: port, baud rate, watchdog.
-        arm: joints and torque constants.
-        clock: the flight clock, source of all stamps.
-        jaws: the clamp's servo; None without a clamp.
     """
 
     options = DynamixelOptions

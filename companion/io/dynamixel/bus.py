@@ -43,8 +43,6 @@ class ArmBus:
     """The arm's servos on one port, which may be of several models. Not thread-safe.
 
     Args:
-        device: port, baud rate, watchdog.
-        arm: joints and torque constants.
         aborted: called between the steps of `open`; True aborts it.
         jaws: the clamp's servo on the same bus; None without a clamp.
     """

@@ -20,10 +20,6 @@ class JawsServo:
 
     A command is sent without a request for an answer, which would delay the joints, and again after each read of the bus until the
     read shows that the servo has taken it.
-
-    Args:
-        jaws: servo, angles and current.
-        servos: access to the bus.
     """
 
     def __init__(self, jaws: Jaws, servos: ServoAccess) -> None:

@@ -21,7 +21,6 @@ _STATUS_HEAD: Final = struct.Struct("<4sBHBB")
 _CRC: Final = struct.Struct("<H")
 _GOAL: Final = struct.Struct("<Bh")
 STATUS_BYTES: Final = _STATUS_HEAD.size + _CRC.size
-"""Bytes of a status packet without its data."""
 
 
 def sync_read(address: int, size: int, ids: Sequence[int]) -> bytes:
@@ -38,9 +37,7 @@ def sync_write_int16(address: int, ids: Sequence[int], values: Sequence[int]) ->
 
 
 def status_data(packet: bytes, servo_id: int, size: int) -> tuple[bytes, int] | None:
-    """Return the data and the error byte of a status packet; None unless `packet` is exactly one intact packet of this servo with
-    `size` bytes of data and without stuffing.
-    """
+    """Return data and error byte of a status packet; None unless it is one intact packet of this servo with `size` data bytes."""
     if len(packet) != STATUS_BYTES + size:
         return None
     header, sender, length, instruction, error = _STATUS_HEAD.unpack_from(packet)

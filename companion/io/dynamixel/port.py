@@ -181,9 +181,7 @@ class ServoPort(PortHandler):  # type: ignore[misc]
 
 
 class SimulatedPort(ServoPort):
-    """Serial port to the servo bus in simulated time, which stands while a reply is on its way: a reply is missing once the world has
-    answered everything that was written.
-    """
+    """Serial port to the servo bus in simulated time: a reply is missing once the world has answered all that was written."""
 
     def __init__(self, port_name: str | None, simulated: SimulatedTime) -> None:
         super().__init__(port_name)
@@ -238,7 +236,6 @@ def servo_port(port_name: str | None) -> ServoPort:
 
 
 def _open_failure(port: str, error: Exception) -> str:
-    """Return the reason why a port did not open, and the remedy, in one line."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT or not Path(port).exists():
         found = sorted(p.device for p in list_ports.comports())

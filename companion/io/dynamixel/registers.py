@@ -125,8 +125,6 @@ class JawsBlock:
 
     @staticmethod
     def from_bytes(data: bytes) -> JawsBlock | None:
-        """Decode `BLOCK_SIZE` bytes of indirect data; None if they are those of a servo that has restarted (a loose supply): its
-        indirect addresses are lost, and all bytes are zero.
-        """
+        """Decode `BLOCK_SIZE` bytes of indirect data; None if all are zero: the servo has restarted and lost its addresses."""
         block = JawsBlock(*_BLOCK.unpack(data))
         return block if block.temperature_c else None

@@ -52,8 +52,6 @@ def joint_scale(joint: Joint, torque_per_amp_nm_a: float, current_limit_counts: 
     """Return the scale of a joint.
 
     Args:
-        joint: limits, zero, direction and model of its servo.
-        torque_per_amp_nm_a: torque constant of its servo, N m/A.
         current_limit_counts: current limit of its servo (register 38).
 
     Raises:

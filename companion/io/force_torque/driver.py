@@ -28,6 +28,7 @@ _REPEAT_S: Final = 0.4
 _FIRST_SAMPLES: Final = 5
 _READ_BYTES: Final = 4096
 _MODEL: Final = "RFT60"
+_ON_THEIR_WAY_S: Final = 0.2
 
 
 class RobotousForceTorque(SampleStream):
@@ -37,8 +38,6 @@ class RobotousForceTorque(SampleStream):
     `latest()` becomes stale and nothing is raised. A port that comes back under its name is opened again by `latest()`.
 
     Args:
-        device: port, rate and the force above which a sample counts as overloaded.
-        clock: the flight clock.
         answer_timeout_s: timeout for each reply of the sensor, and for the first samples.
     """
 
@@ -80,6 +79,17 @@ class RobotousForceTorque(SampleStream):
             bad_sums=self._scanner.bad_sums,
             lost=self._lost,
         )
+
+    async def set_bias(self, on: bool) -> None:
+        """Set the sensor's own zero to the current reading (SET_BIAS 1) or clear it (0), and drop the samples in transit.
+
+        No flight uses it. The sensor does not acknowledge the command; check its reading.
+
+        Raises:
+            DeviceError: the sensor stopped sending.
+        """
+        self._send(Command.SET_BIAS, int(on))
+        await self.tare_samples(_ON_THEIR_WAY_S)
 
     async def __aenter__(self) -> Self:
         """Open the port, identify the sensor, set its rate, start continuous output, wait for the first samples.
@@ -156,9 +166,7 @@ class RobotousForceTorque(SampleStream):
         return rft.RATE_CODES.get((await self._ask(Command.GET_RATE))[1])
 
     async def _ask(self, command: Command, parameter: int = 0, repeat_s: float | None = None) -> bytes:
-        """Send one request and return its reply. The first request is repeated, because half a command from an earlier run may be
-        in the sensor's buffer and corrupt the request.
-        """
+        """Send one request and return its reply. The first one is repeated: half a command from before may corrupt it."""
         loop = asyncio.get_running_loop()
         deadline_s = loop.time() + self._answer_timeout_s
         answer: asyncio.Future[bytes] = loop.create_future()

@@ -36,11 +36,6 @@ class PluginForceTorque(SampleStream):
     """Readings of a plug-in's sensor; implements `companion.io.protocols.ForceTorque`.
 
     An invalid reading is dropped and counted. When `read` raises or no longer returns, `latest()` becomes stale and nothing is raised.
-
-    Args:
-        device: `devices.force` of the vehicle file.
-        clock: the flight clock.
-        first_timeout_s: timeout for the first samples.
     """
 
     def __init__(self, device: ForceDevice, clock: Clock, *, first_timeout_s: float = 2.0) -> None:

@@ -113,9 +113,7 @@ def decode_wrench(data: bytes) -> Wrench:
 
 
 def decode_text(data: bytes) -> str:
-    """Return the name, serial number or firmware version in a response: the ASCII text from data byte 1 to the first zero byte, with
-    unprintable characters replaced by "?".
-    """
+    """Return the text in a response: ASCII from data byte 1 to the first zero byte, unprintable characters replaced by "?"."""
     text = data[1:].partition(b"\0")[0].decode("ascii", "replace")
     return "".join(character if character.isprintable() else "?" for character in text).strip()
 

@@ -19,7 +19,6 @@ class SampleStream:
 
     Args:
         where: device and address, for errors.
-        rate_hz: expected rate.
     """
 
     def __init__(self, where: str, rate_hz: float) -> None:

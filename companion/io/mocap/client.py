@@ -36,7 +36,6 @@ class NatNetClient:
         body_id: streaming id of the rigid body.
         up_axis: "y" or "z": Motive's streaming setting.
         transport: "unicast" or "multicast"; a unicast server forgets a client that sends no keep-alives.
-        application: name of this client in connect requests.
         ball: `devices.mocap.ball`; None if no marker is read.
     """
 
@@ -138,7 +137,6 @@ class NatNetClient:
         """Return the rigid body's pose in the world frame, or None if the frame does not contain it.
 
         Args:
-            frame: as returned by `receive`.
             stamp_s: arrival of its datagram on the flight clock, s.
         """
         body = frame.body
@@ -163,8 +161,6 @@ class NatNetClient:
         the only marker, as long as it is tracked.
 
         Args:
-            frame: as returned by `receive`.
-            datagram: the datagram from which the frame was read.
             stamp_s: arrival of the datagram on the flight clock, s.
         """
         if self._ball is None:
@@ -184,9 +180,6 @@ class NatNetClient:
         """Return the bar's rigid body in the world frame, or None if the frame does not contain it.
 
         Args:
-            frame: as returned by `receive`.
-            datagram: the datagram from which the frame was read.
-            bar_id: streaming id of the bar's rigid body.
             stamp_s: arrival of the datagram on the flight clock, s.
         """
         body = self.other_body(datagram, bar_id) if bar_id in frame.body_ids else None

@@ -25,11 +25,6 @@ class ContainedClient:
 
     An exception and an invalid pose are each counted as a malformed datagram, and the first exception is logged. A call that takes long
     is reported, unless the client names the sockets that it reads: then it has nothing to wait for, and the computer was busy.
-
-    Args:
-        client: the system's client.
-        settings: the settings from which it was made.
-        clock: clock of all times.
     """
 
     def __init__(self, client: PoseClient, settings: MocapSettings, clock: Clock) -> None:
@@ -37,7 +32,6 @@ class ContainedClient:
         self._clock = clock
         self.extended = client if isinstance(client, ExtendedClient) else ExtendedClient()
         self.where = self.extended.where or f"mocap {settings.type} {settings.server}"
-        """Beginning of a text on this client."""
         self.extended.clock = clock
         self._markers: MarkerFrame | None = None
         self._rejected = 0

@@ -47,10 +47,7 @@ class MocapDriver:
     the newest is delivered. Without poses the safety rules land the vehicle.
 
     Args:
-        device: `devices.mocap` of the vehicle file.
-        clock: the flight clock.
         on_pose: called with every new pose; an exception is logged once and never stops the reception.
-        connect_timeout_s: timeout for the server's answer.
         body_timeout_s: timeout for the first pose in which the body is tracked.
         make_client: makes the client in place of the installed system; opening then waits for any frame, not for the body.
 
@@ -262,7 +259,6 @@ class MocapDriver:
 
 
 def _is_address(server: str) -> bool:
-    """Return whether the server is given as an IPv4 address, not as a name."""
     try:
         return bool(socket.inet_aton(server))
     except OSError:

@@ -207,11 +207,7 @@ def _skip_sized(data: bytes, offset: int) -> int:
 
 
 def _skip_unknown(data: bytes, offset: int) -> int:
-    """Return the offset of the suffix, which follows any unknown sections that begin at `offset`.
-
-    If the data from `offset` on does not consist of whole sections and a suffix of the known size, the suffix has grown and starts
-    at `offset`.
-    """
+    """Return the suffix's offset after unknown sections at `offset`; if they do not end in one of known size, `offset`."""
     end = offset
     while len(data) - end > SUFFIX_BYTES:
         end = _skip_sized(data, end)

@@ -17,7 +17,6 @@ def marker_frame(
     Args:
         stamp_s: arrival of the frame.
         age_s: time from mid-exposure to arrival; None if the system does not stamp exposures.
-        number: frame number.
         positions_world_m: finite positions of the markers.
         vehicle_world_m: the newest position at which the vehicle was tracked.
     """

@@ -40,9 +40,6 @@ class _Options:
 class OptiTrack(ExtendedClient):
     """Receives the poses of one rigid body from Motive; implements `companion.io.mocap.system.PoseClient`.
 
-    Args:
-        settings: addresses, transport, version, body id and up axis.
-
     Raises:
         DeviceError: the server's name cannot be resolved, or a socket cannot be opened.
     """
@@ -61,7 +58,6 @@ class OptiTrack(ExtendedClient):
             ) from None
         self.sockets: list[socket.socket] = []
         self.protocol = NatNetClient(settings.rigid_body_id, settings.up_axis, settings.transport, ball=settings.ball)
-        """State of the protocol, for tools."""
         self._markers: MarkerFrame | None = None
         self._bar: BarPose | None = None
         self._foreign = 0
@@ -243,9 +239,7 @@ class OptiTrack(ExtendedClient):
         return opened
 
     def _join(self) -> None:
-        """Open the port of the multicast group. It is bound to the group, so that nothing else that reaches the port is received, and
-        shared: the guardian receives too.
-        """
+        """Open the multicast group's port, bound to the group, which excludes other traffic, and shared with the guardian."""
         group, interface = self._settings.multicast_group, self._settings.interface
         data = self._open(group, self._settings.data_port, "multicast_group")
         try:

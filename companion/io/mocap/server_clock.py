@@ -37,9 +37,7 @@ class ServerClock:
         self._offset_s, self._echo_s = max(self._offsets_s), sent_s
 
     def age_s(self, exposure_server_s: float, latency_s: float, arrived_s: float) -> float:
-        """Return the time from the exposure of a frame to its arrival; `latency_s`, the part up to the transmission, if no echo request
-        has been answered of late.
-        """
+        """Return the time from a frame's exposure to its arrival; `latency_s`, up to the transmission, without a recent echo."""
         offset_s = self._offset_s
         if offset_s is None:
             return latency_s

@@ -51,10 +51,8 @@ def join_source(opened: socket.socket, group: str, interface: str, source: str) 
     """Join a multicast group for datagrams from one sender: the kernel (and a switch with IGMPv3 snooping) drops those from others.
 
     Args:
-        opened: UDP socket, bound to the group.
         group: multicast address, IPv4.
         interface: this computer's address on the camera network.
-        source: address of the Motive computer.
 
     Raises:
         OSError: no such interface, or not a multicast address.

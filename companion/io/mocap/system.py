@@ -62,9 +62,7 @@ class PoseClient(Protocol):
 
     @property
     def server_name(self) -> str:
-        """Program and protocol, such as "Vicon Tracker, UDP object stream". An `ExtendedClient` may return an empty text before the
-        server has answered.
-        """
+        """Program and protocol, such as "Vicon Tracker, UDP object stream". An `ExtendedClient` may return "" before an answer."""
 
     @property
     def problem(self) -> str | None:
@@ -102,9 +100,7 @@ class ExtendedClient:
     sockets: Sequence[socket.socket] = ()
     """Sockets that stay open from the constructor to `close`: `poses` is called as soon as one of them is readable, and reads all."""
     clock: Clock | None = None
-    """Clock of `now_s`, set before the first call of `poses`. What arrives during a call is stamped by it: `now_s` is older by the time
-    that the process has waited for a core since.
-    """
+    """Clock of `now_s`, set before `poses` is called; it stamps what arrives during a call, for which `now_s` is too old."""
     sees_markers: ClassVar[bool] = False
     """Whether the system hands on single markers; a class without it is refused for a vehicle with `devices.mocap.ball`."""
     where = ""
@@ -115,9 +111,7 @@ class ExtendedClient:
         return ""
 
     def bodies(self) -> Mapping[int, str] | None:
-        """Return the rigid bodies of the newest frame by streaming id, with their names, which are empty if not known; None before the
-        first frame, and if the client does not know them.
-        """
+        """Return the newest frame's rigid bodies by streaming id, with their names or ""; None before one, or if not known."""
         return None
 
     def markers(self) -> MarkerFrame | None:
@@ -127,9 +121,7 @@ class ExtendedClient:
         return None
 
     def bar(self) -> BarPose | None:
-        """Return the bar's rigid body in the newest frame that had it, in the world frame; None before the first, and without
-        `MocapSettings.bar_id`.
-        """
+        """Return the bar's rigid body in the newest frame that had it, world frame; None before, or without `bar_id`."""
         return None
 
     def counts(self) -> Counts:
@@ -141,9 +133,7 @@ class ExtendedClient:
         return False
 
     def refusal(self) -> str | None:
-        """Return why the flight must not start with this server or body, as one line, or None; called once the server's name is known,
-        and again once the body is tracked.
-        """
+        """Return why the flight must not start with this server or body, or None; called for the server, then for the body."""
         return None
 
     def silence(self, waited_s: float) -> str | None:

@@ -55,10 +55,7 @@ class MavsdkAutopilot:
     Attitude setpoints are sent by the path in `devices.autopilot.setpoint_path`; see `companion.io.px4.setpoints`.
 
     Args:
-        device: address and setpoint path.
-        clock: the flight clock.
         forwarding: whether a second connection is needed; see `forward_to`.
-        estimator_rate_hz: requested rate of ESTIMATOR_STATUS.
     """
 
     def __init__(
@@ -157,17 +154,13 @@ class MavsdkAutopilot:
         return self._traffic.forward_to(port)
 
     def vehicle(self) -> VehicleState | None:
-        """Read the link, then return the latest fused state, or None before position, attitude, rates and IMU have all arrived. Stamps
-        are arrival times.
-        """
+        """Read the link; return the latest fused state, None before all of its parts have arrived. Stamps are arrival times."""
         self._poll()
         self._ask_for_heartbeat()
         return self._inbox.vehicle()
 
     def status(self) -> AutopilotStatus | None:
-        """Return the latest status, or None before the first heartbeat. `heartbeat_stamp_s` is the arrival of the newest
-        HEARTBEAT.
-        """
+        """Return the latest status, or None before the first heartbeat. `heartbeat_stamp_s` is the newest one's arrival."""
         return self._inbox.status()
 
     def estimator(self) -> EstimatorReport | None:
@@ -327,9 +320,7 @@ class MavsdkAutopilot:
             self._send_message(messages.HEARTBEAT_ID, messages.GROUND_STATION_HEARTBEAT)
 
     def _ask_for_heartbeat(self) -> None:
-        """Request HEARTBEAT from an armed PX4, which refuses another rate than one per second: a kill or a pilot's mode must be seen
-        sooner.
-        """
+        """Request HEARTBEAT from an armed PX4, which sends no more than one per second: a kill must be seen sooner."""
         status, now_s = self._inbox.status(), self._clock()
         if self._open and status is not None and status.armed and now_s - self._asked_s >= HEARTBEAT_ASK_PERIOD_S:
             self._asked_s = now_s
@@ -337,7 +328,6 @@ class MavsdkAutopilot:
             self._send_message(*messages.command_long(messages.REQUEST_MESSAGE, heartbeat, 0.0, self._system_id))
 
     def _pump(self) -> None:
-        """Read the link regularly while the flight loop does not."""
         assert self._loop is not None
         idle = self._traffic is not None and self._clock() - self._traffic.polled_s > 1.5 * _PUMP_S
         if idle:

@@ -75,7 +75,6 @@ class Frame:
 
     @property
     def _end(self) -> int:
-        """Return the end of the payload."""
         return len(self.data) - (_SIGNATURE_BYTES if self.signed else 0) - _CHECKSUM_BYTES
 
 
@@ -145,12 +144,7 @@ class FrameReader:
 
 
 class FrameWriter:
-    """Makes the frames that leave a link, and numbers them. The sequence number may be taken by several threads.
-
-    Args:
-        system: own system id.
-        component: own component id.
-    """
+    """Makes the frames that leave a link, and numbers them. The sequence number may be taken by several threads."""
 
     def __init__(self, system: int, component: int) -> None:
         self._system, self._component = system, component
@@ -160,7 +154,6 @@ class FrameWriter:
         """Return a MAVLink 2 frame.
 
         Args:
-            message_id: a message of the dialect.
             payload: fields in the order of the wire; trailing zeros are truncated.
         """
         payload = payload.rstrip(b"\0") or b"\0"

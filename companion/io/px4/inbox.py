@@ -74,7 +74,6 @@ class Inbox:
 
         Args:
             stamp_s: arrival on the flight clock.
-            message_id: MAVLink message id.
             frame: whole frame with a valid checksum.
         """
         taker, listeners = self._takers.get(message_id), self._listeners.get(message_id)
@@ -98,9 +97,7 @@ class Inbox:
             listeners.remove(listener)
 
     def vehicle(self) -> VehicleState | None:
-        """Return the latest fused state, or None before position, attitude, rates and IMU have all arrived. Stamps are arrival
-        times.
-        """
+        """Return the latest fused state, or None before all of its parts have arrived. Stamps are arrival times."""
         position, attitude, imu = self._position, self._attitude, self._imu
         if position is None or attitude is None or imu is None:
             return None
@@ -120,9 +117,7 @@ class Inbox:
         return self._vehicle
 
     def status(self) -> AutopilotStatus | None:
-        """Return the latest status, or None before the first heartbeat. `heartbeat_stamp_s` is the arrival of the newest
-        HEARTBEAT.
-        """
+        """Return the latest status, or None before the first heartbeat. `heartbeat_stamp_s` is the newest one's arrival."""
         if self._heartbeat is None:
             return None
         stamp_s, armed, mode, system_status = self._heartbeat

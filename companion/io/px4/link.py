@@ -84,9 +84,7 @@ def open_link(address: str, peer: tuple[str, int] | None, clock: Clock, report: 
     """Return the open wire to PX4; its port is the claim's (`companion.io.px4.exclusive_link`). Blocks while a TCP connection is made.
 
     Args:
-        address: checked address.
         peer: PX4's verified UDP address.
-        clock: the flight clock.
         report: called with a line when PX4 is received at another port.
 
     Raises:

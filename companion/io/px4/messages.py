@@ -139,9 +139,7 @@ def landed_state(value: int) -> LandedState:
 
 
 def battery(voltages_mv: Sequence[int], remaining_percent: int) -> tuple[float | None, float | None]:
-    """Return voltage (V) and remaining charge (0 to 1) of BATTERY_STATUS, given the fields `voltages` and `battery_remaining`. A value
-    that the autopilot does not know is None.
-    """
+    """Return voltage (V) and charge (0 to 1) of BATTERY_STATUS from `voltages` and `battery_remaining`; None if unknown."""
     voltage_v = sum(cell for cell in voltages_mv if cell != _NO_CELL) * 1e-3
     return voltage_v or None, min(remaining_percent / 100.0, 1.0) if remaining_percent >= 0 else None
 
@@ -179,9 +177,7 @@ def vehicle_state(
     imu_stamp_s: float,
     specific_force_frd_m_s2: Vec3,
 ) -> VehicleState | None:
-    """Return LOCAL_POSITION_NED, ATTITUDE_QUATERNION and HIGHRES_IMU in the companion's frames, or None if any value is not finite or
-    the quaternion is zero.
-    """
+    """Return position, attitude and IMU messages in the companion's frames, or None if a value is not finite or the quaternion is 0."""
     values = (*position_ned_m, *velocity_ned_m_s, *attitude_ned_frd, *rates_frd_rad_s, *specific_force_frd_m_s2)
     if not all(map(math.isfinite, values)):
         return None
@@ -224,9 +220,7 @@ def attitude_target_deg(setpoint: AttitudeSetpoint) -> Vec3:
 
 
 def attitude_target(setpoint: AttitudeSetpoint, time_boot_ms: int, target_system: int) -> bytes:
-    """Return the payload of SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, body rates ignored; raises the errors of
-    `attitude_target_ned`.
-    """
+    """Return the payload of SET_ATTITUDE_TARGET: quaternion FRD -> NED and thrust, no rates; raises as `attitude_target_ned`."""
     q, target = attitude_target_ned(setpoint), (target_system, MAV_COMP_ID_AUTOPILOT1, TYPE_MASK_IGNORE_RATES)
     return _ATTITUDE_TARGET.pack(time_boot_ms & 0xFFFFFFFF, *q, 0.0, 0.0, 0.0, setpoint.thrust, *target)
 
@@ -291,9 +285,7 @@ def set_global_origin(
 
 
 def estimator_report(fields: Mapping[str, Any], stamp_s: float) -> EstimatorReport:
-    """Convert ESTIMATOR_STATUS. PX4 sends NaN for the test ratio of a source that it does not fuse (converted to 0) and for an unknown
-    accuracy (converted to infinity).
-    """
+    """Convert ESTIMATOR_STATUS; NaN for a ratio that is not fused becomes 0, for an unknown accuracy infinity."""
 
     def number(key: str, unknown: float) -> float:
         value = fields[key]

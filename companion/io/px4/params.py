@@ -94,9 +94,7 @@ class ParamQueries:
 
 
 def value_of(message: Any) -> tuple[str, Value]:
-    """Return the name and the value in a PARAM_VALUE; the value is an int where PX4 stores one, whose bytes it sends in place of the
-    float.
-    """
+    """Return the name and the value in a PARAM_VALUE: an int where PX4 stores one, whose bytes it sends in place of the float."""
     frame = message.get_msgbuf()
     wire = frame[_PAYLOAD[frame[0]] :][:4]  # a float in Python would change the bytes of some integers
     value: Value = struct.unpack("<f" if message.param_type == messages.MAV_PARAM_TYPE_REAL32 else "<i", wire)[0]

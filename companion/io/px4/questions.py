@@ -25,8 +25,6 @@ class Questions:
 
     Args:
         address: as in `devices.autopilot.address`, for errors.
-        system_id: PX4's.
-        inbox: receives the answers.
         send: sends a message, given by id and payload.
     """
 
@@ -45,7 +43,6 @@ class Questions:
         Args:
             expected: what PX4 is asked for, for the error.
             question: id and payload of a message.
-            answer_id: message id of the answer.
             answer: returns None for a message that is not the answer.
 
         Raises:

@@ -63,7 +63,6 @@ class RequestQueue:
         Args:
             command: MAV_CMD.
             result: MAV_RESULT.
-            now_s: flight clock.
         """
         waiting = [
             (kind.waits_since_s, request.name, kind)

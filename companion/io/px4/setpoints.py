@@ -60,8 +60,6 @@ def setpoint_path(
     """Return the path that `devices.autopilot.setpoint_path` selects.
 
     Args:
-        kind: the path.
-        system: the MAVSDK system.
         send: sends a message, given by id and payload; returns whether it was sent.
         write: sends a frame of MAVSDK's; returns whether it was sent.
     """
@@ -70,9 +68,7 @@ def setpoint_path(
 
 
 class DirectSetpoints:
-    """Setpoints straight onto the link. A setpoint is sent only when the flight loop calls, so PX4's offboard-loss failsafe triggers if
-    the companion hangs.
-    """
+    """Setpoints straight onto the link, only when the flight loop calls: if the companion hangs, PX4's offboard-loss failsafe acts."""
 
     def __init__(self, send: Callable[[int, bytes], bool], system_id: int) -> None:
         self._send = send
@@ -102,7 +98,6 @@ class OffboardSetpoints:
     flight would then depend on the computer's clock; there the plugin has nothing to repeat, at the cost of a second call.
 
     Args:
-        system: the MAVSDK system.
         write: sends a frame of MAVSDK's; returns whether it was sent.
         direct: sends what the plugin has not sent in time.
     """

@@ -49,7 +49,6 @@ class Texts:
 
         Args:
             fields: fields of the message: `severity` (MAV_SEVERITY), `text`, `id`, `chunk_seq`.
-            now_s: flight clock.
         """
         identity, chunk, text = int(fields["id"]), int(fields["chunk_seq"]), str(fields["text"])
         parts = self._parts

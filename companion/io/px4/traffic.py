@@ -28,8 +28,6 @@ class Traffic:
         wire: the open link, which this object closes.
         own_ids: own system and component id.
         stream: whether the link is a stream of bytes and not of datagrams.
-        clock: the flight clock.
-        inbox: takes PX4's messages.
         to_mavsdk: takes the frames of all messages but those that the inbox reads from their bytes.
         reports: receives a line when the link is lost and when it is open again.
     """
@@ -81,9 +79,7 @@ class Traffic:
             self._wire.system = system_id
 
     def forward_to(self, port: int) -> int:
-        """Forward MAVLink between PX4 and a local UDP port. Return the local port from which it is sent; datagrams of all other senders
-        are ignored.
-        """
+        """Forward MAVLink between PX4 and a local UDP port, the only accepted sender; return the local port that sends."""
         self._relay = relay = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         relay.setblocking(False)
         relay.bind(("127.0.0.1", 0))

@@ -88,7 +88,6 @@ class UdpWire(_ChannelWire):
     Args:
         local: address to bind; None for any.
         remote: PX4's address; None to use the sender of the first valid HEARTBEAT of an autopilot.
-        clock: clock of the arrivals.
         share_port: another socket that reads nothing holds the port as well: that of the process's claim, or of a killed flight
             process. Of several sockets connected to PX4, the newest receives the datagrams (measured, Linux 6.18).
         report: called with a line when PX4 is received at another port.
@@ -178,11 +177,7 @@ class UdpWire(_ChannelWire):
 
 
 def _disconnect(connected: socket.socket) -> None:
-    """Let the socket receive from every sender again. It keeps its local port.
-
-    Raises:
-        OSError: the kernel refuses.
-    """
+    """Let the socket receive from every sender again, on the same local port; raises OSError."""
     if _libc.connect(connected.fileno(), _ANY_PEER, len(_ANY_PEER)) != 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
@@ -265,7 +260,6 @@ def open_wire(
         address: value of `devices.autopilot.address`.
         local_port: own UDP port of a `udpout` link; 0 for any.
         peer: PX4's UDP address as a HEARTBEAT has confirmed it; None if unknown.
-        clock: clock of the arrivals.
         share_port: another socket that reads nothing holds the port as well; only for UDP links (`is_udp`).
         report: see `UdpWire`.
 

@@ -64,9 +64,7 @@ class DownlinkFilter:
         return picked
 
     def _extra(self, frame: Frame) -> int | None:
-        """Return CRC_EXTRA of the frame's message. If the dialect does not define the message, derive it from its first frame by trying
-        all 256 values against the checksum.
-        """
+        """Return the message's CRC_EXTRA; if the dialect lacks it, find it by its first frame: all 256 values are tried."""
         if frame.message_id not in self._extras:
             fits = (extra for extra in range(256) if frame.right_checksum(extra) == frame.checksum)
             self._extras[frame.message_id] = next(fits, None)

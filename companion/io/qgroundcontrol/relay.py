@@ -46,7 +46,6 @@ class Relay:
     """Relay between one vehicle and one ground station.
 
     Args:
-        channel: channel to the flight process.
         vehicle: UDP, bound on loopback; connected once the flight process's port is known.
         ground: UDP, connected to the ground station.
         uplink: filter of the ground station's messages.
@@ -174,7 +173,6 @@ class Relay:
 
 
 def _received(source: socket.socket) -> list[bytes]:
-    """Return the waiting datagrams, up to one round's limit."""
     datagrams = []
     for _ in range(_ROUND_DATAGRAMS):
         try:

@@ -70,7 +70,6 @@ class GroundStation:
 
     Args:
         address: `udpout://HOST:PORT`.
-        autopilot: open driver.
         while_armed: as `ground.qgroundcontrol_while_armed`.
         console: as `ground.qgroundcontrol_console`.
     """
@@ -146,9 +145,7 @@ class GroundStation:
             self._send(said)
 
     def take_messages(self) -> list[str]:
-        """Return lines for the operator since the last call: a ground station appeared, messages were refused, the relay is gone. Never
-        waits.
-        """
+        """Return lines for the operator since the last call, on ground station, refused messages and relay. Never waits."""
         for _ in range(_MESSAGES_PER_CALL):
             if self._channel is None:
                 break

@@ -18,13 +18,10 @@ from companion.runtime.token_bucket import TokenBucket
 
 COMPONENT = int(mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
 TEXT_BYTES = 50
-"""Size of STATUSTEXT.text."""
 TEXT_MAX_BYTES = 4 * TEXT_BYTES
 TEXT_RATE_HZ = 5.0
 TEXT_BURST = 10
 TEXTS_WAITING_MAX = 20
-VALUE_NAMES = ("slack_m", "stop_slk_m", "e_p_m", "e_q_deg", "rho", "payload_kg", "progress")
-"""Values of NAMED_VALUE_FLOAT.name, 10 characters at most."""
 
 _CRITICAL, _WARNING, _NOTICE, _INFO = 2, 4, 5, 6
 _SEVERITIES = {Severity.INFO: _INFO, Severity.WARNING: _WARNING, Severity.CRITICAL: _CRITICAL}
@@ -32,7 +29,6 @@ _OUTCOMES = {Outcome.COMPLETED: _NOTICE, Outcome.REFUSED: _WARNING, Outcome.ABOR
 
 FLOAT32_MAX = 3.4e38
 Text = tuple[int, str]
-"""MAV_SEVERITY and the text."""
 
 
 def event_text(event: Event) -> Text:
@@ -53,7 +49,7 @@ def outcome_text(outcome: Outcome) -> Text:
 
 
 def values(inputs: Inputs, outputs: Outputs) -> dict[str, float]:
-    """Return the known values by their names in `VALUE_NAMES`.
+    """Return the known values by their names for NAMED_VALUE_FLOAT, of 10 characters at most.
 
     The tether's slack, the slack at the stopping position and the position error are in m, the angle between attitude and setpoint in
     deg, masses in kg, progress from 0 to 1; rho is that of the control law.
@@ -72,9 +68,7 @@ def values(inputs: Inputs, outputs: Outputs) -> dict[str, float]:
 
 
 class Texts:
-    """STATUSTEXTs at a rate that suits a slow link: bursts of 10, then 5 per second, the most severe first. Dropped texts are
-    counted and reported.
-    """
+    """STATUSTEXTs at a rate for slow links: bursts of 10, then 5 per second, most severe first; dropped ones are counted."""
 
     def __init__(self) -> None:
         self._waiting: deque[Text] = deque()
@@ -102,9 +96,7 @@ class Texts:
         return messages
 
     def _chunks(self, severity: int, text: str) -> list[Any]:
-        """Return one message, or several with a common id other than 0. A text that fills its last chunk is followed by an
-        empty one.
-        """
+        """Return one message, or several with a common id other than 0; a text that fills its last chunk gets an empty one."""
         data = "".join(c if c.isascii() and c.isprintable() else "?" for c in " ".join(text.split())).encode()
         if len(data) > TEXT_MAX_BYTES:
             data = data[: TEXT_MAX_BYTES - 3] + b"..."
@@ -127,9 +119,7 @@ def value_messages(time_boot_ms: int, named: Mapping[str, float]) -> list[Any]:
 
 
 def heartbeat_message() -> Any:
-    """Return a HEARTBEAT with MAV_TYPE_ONBOARD_CONTROLLER, MAV_AUTOPILOT_INVALID and MAV_STATE_ACTIVE, so that ground stations do not
-    show the companion as a vehicle.
-    """
+    """Return a HEARTBEAT of an onboard controller that is no autopilot, so that ground stations show no second vehicle."""
     return mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
     )

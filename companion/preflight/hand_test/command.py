@@ -53,8 +53,6 @@ async def run_hand_test(
     Args:
         devices: open devices; poses need not be forwarded to PX4. An open arm is read during the test to keep its watchdogs from
             tripping.
-        config: the effective configuration.
-        console: terminal of the operator.
         json: whether standard output must stay free; all text for the operator then goes to standard error.
         record: file in which a passed test is recorded (`hand_record.record_path()`); None to record nothing, as in SITL.
     """
@@ -142,7 +140,6 @@ class _StampClock:
 
 @contextlib.contextmanager
 def _interrupted(stop: asyncio.Event) -> Iterator[None]:
-    """Set the event on Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -156,7 +153,6 @@ def _interrupted(stop: asyncio.Event) -> Iterator[None]:
 
 
 def _show(bars: Bars, view: HandView) -> None:
-    """Show the step, its progress, and why the last attempt did not count."""
     number = f"{_STEPS.index(view.step) + 1}/{len(_STEPS)}" if view.step in _STEPS else "   "
     bars.say(
         f"   {view.notice}" if view.notice else f"{number}  {INSTRUCTIONS[view.step]}", "yellow" if view.notice else ""

@@ -30,7 +30,6 @@ class Setup:
     """Settings for which a passed test is valid. A change of any of them invalidates it."""
 
     vehicle: str
-    """Name of the vehicle."""
     server: str
     """devices.mocap.server."""
     rigid_body_id: int

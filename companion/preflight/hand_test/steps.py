@@ -107,7 +107,6 @@ class HandView:
 
     step: Step
     progress: float
-    """Progress of this step, 0 to 1."""
     seen: str
     """Motion measured by motion capture, as text."""
     notice: str

@@ -17,9 +17,6 @@ class Air:
     """Gusts on the base.
 
     Args:
-        config: section `air`.
-        seed: seed of the world.
-        bodies: the model of the scene.
         weight_n: weight of the vehicle, equal to its thrust in hover.
     """
 
@@ -46,11 +43,6 @@ class Air:
         self._loads.set(self._base, "air", *load)
 
     def strength(self, thrust_n: float, height_m: float) -> float:
-        """Return the gusts' strength relative to hover far from the floor.
-
-        Args:
-            thrust_n: thrust of all rotors.
-            height_m: height of the base above the floor.
-        """
+        """Return the gusts' strength relative to hover far from the floor."""
         near = max(0.0, 1.0 - height_m / self._config.floor_range_m)
         return thrust_n / self._weight_n * (1.0 + self._config.floor_increase * near)

@@ -27,7 +27,6 @@ class BatteryPack:
     """The battery; call `step` once per physics step.
 
     Args:
-        config: section `battery`.
         start: state of charge at arming, 0 to 1.
         life_s: hover time with a full battery.
         weight_n: weight of the vehicle, for the hover current.

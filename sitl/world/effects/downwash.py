@@ -31,18 +31,11 @@ _ROOT_HALF: Final = math.sqrt(0.5)
 
 
 class Wakes:
-    """Time-averaged dynamic pressure below the rotors.
-
-    Args:
-        layout: layout of the rotors.
-        radius_m: radius of a rotor.
-        spread: see section `downwash`.
-    """
+    """Time-averaged dynamic pressure below the rotors."""
 
     def __init__(self, layout: RotorLayout, radius_m: float, spread: float) -> None:
         self._radius_m, self._spread = radius_m, spread
         self._across_m = list(dict.fromkeys(y for _, y, _ in layout.positions_body_m))
-        """Positions along y."""
         rows: dict[float, list[tuple[int, int]]] = {}
         for i, (x, y, _) in enumerate(layout.positions_body_m):
             rows.setdefault(x, []).append((i, self._across_m.index(y)))
@@ -82,9 +75,7 @@ def _smeared(x_m: float, half_m: float, per_m: float) -> float:
 
 
 def _links_of(vehicle: Vehicle) -> list[tuple[int, Vec3, float]]:
-    """Return the number of each link of more than zero length, the direction from its joint to its end in its own frame, and its length
-    in m.
-    """
+    """Return number, direction (from joint to end, own frame) and length, m, of each link of more than zero length."""
     chain, found = chain_of(without_tool(vehicle)), []
     for number in range(1, len(chain.links) + 1):
         x, y, z = chain.links[number].position_m if number < len(chain.links) else chain.tip_m
@@ -98,12 +89,7 @@ class Downwash:
     """The forces of the rotors' wakes.
 
     Args:
-        config: section `downwash`.
-        rotor_radius_m: radius of a rotor.
-        payload_radius_m: radius of the payload.
-        vehicle: vehicle file.
         bodies: the model of the scene; the wakes load the arm and the net of the machine, and the payload.
-        seed: seed of the world.
     """
 
     def __init__(

@@ -27,7 +27,6 @@ class ForceSensor:
     """Errors of the force-torque sensor.
 
     Args:
-        config: section `force_sensor`.
         seed: seed of the world; determines the cross-talk.
     """
 

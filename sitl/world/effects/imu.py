@@ -26,10 +26,8 @@ class ImuErrors:
     """Converts true samples to measured ones.
 
     Args:
-        config: section `imu`.
         interval_s: time from one sample to the next.
         hover_n: thrust of one rotor in hover.
-        layout: layout of the rotors.
     """
 
     def __init__(self, config: Imu, interval_s: float, hover_n: float, layout: RotorLayout) -> None:

@@ -43,9 +43,7 @@ def _rods_as_built(arm: Arm, shoulder_m: Vec3, masses: Joints, longer_m: Joints,
 
 
 def _links_as_built(arm: Arm, shoulder_m: Vec3, masses: Joints, longer_m: Joints, farther_m: Joints) -> dict[str, Any]:
-    """Return the changed keys of an arm with `links`. The errors of length and centre of mass act along the line from the joint to the
-    next joint or to the tip; a link without length has none.
-    """
+    """Return the changed keys of an arm with `links`; length errors act along the line to the next joint or the tip."""
     starts, ends = [_sum(arm.links[0].origin_m, shoulder_m)], [*(link.origin_m for link in arm.links[1:]), arm.tip_m]
     links: list[Link] = []
     for link, end_m, scale, longer, farther in zip(arm.links, ends, masses, longer_m, farther_m, strict=True):
@@ -84,9 +82,7 @@ def shoulder_ypr_rad(machine: Machine) -> Vec3:
 
 
 def inertia_kg_m2(nominal: Vec3, machine: Machine) -> Vec3:
-    """Return the true moments of inertia of the base. Each is limited to the sum of the other two, which no moment of a rigid body
-    exceeds.
-    """
+    """Return the true moments of inertia of the base, each limited to the sum of the other two, as of every rigid body."""
     if not machine.on:
         return nominal
     x, y, z = (moment * (1.0 + error) for moment, error in zip(nominal, machine.inertia_error, strict=True))

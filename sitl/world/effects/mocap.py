@@ -18,12 +18,7 @@ _STREAM = 12
 
 
 class MocapErrors:
-    """Converts true poses to tracked poses.
-
-    Args:
-        config: section `mocap`.
-        seed: seed of the world.
-    """
+    """Converts true poses to tracked poses."""
 
     def __init__(self, config: Mocap, seed: int) -> None:
         self._config, self._seed = config, seed

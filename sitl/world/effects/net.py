@@ -46,7 +46,6 @@ class Bag:
         self.pivot_m = (0.0, 0.0)
         """x and y of the point about which the payload swings."""
         self.entered_s: float | None = None
-        """Time at which the payload entered the bag; None if it is not in the bag."""
         self.touched_s: float | None = None
         """Time of the first contact with hoop or mesh since the throw or the last bounce out of the bag; None before it."""
         self.bounced = False
@@ -65,7 +64,6 @@ class Bag:
         Args:
             position: position of the payload's centre relative to the centre of the hoop.
             velocity: velocity of the payload's centre relative to the point of the net's frame that coincides with it.
-            t_s: world time.
         """
         x, y, z = position
         vx, vy, vz = velocity
@@ -130,14 +128,7 @@ class Bag:
 
 
 class Net:
-    """The net of one vehicle.
-
-    Args:
-        config: section `net`.
-        bodies: the model of the scene.
-        hoop_radius_m: radius of the hoop.
-        payload_radius_m: radius of the payloads.
-    """
+    """The net of one vehicle."""
 
     def __init__(
         self,

@@ -23,13 +23,7 @@ LOWEST_RADII = 0.5
 
 
 class LinearRotors:
-    """Rotors with thrust linear in the motor signal and a single lag, used in a world in which the effect is off.
-
-    Args:
-        count: number of rotors.
-        lag_s: time constant of the thrust.
-        dt_s: physics step.
-    """
+    """Rotors with thrust linear in the motor signal and a single lag, used in a world in which the effect is off."""
 
     def __init__(self, count: int, lag_s: float, dt_s: float) -> None:
         self._gain = 1.0 - math.exp(-dt_s / lag_s)
@@ -55,13 +49,7 @@ class LinearRotors:
 
 
 class Rotors:
-    """The rotors, in PX4's order; call `step` once per physics step.
-
-    Args:
-        config: section `rotors`.
-        layout: layout of the rotors.
-        dt_s: physics step.
-    """
+    """The rotors, in PX4's order; call `step` once per physics step."""
 
     def __init__(self, config: RotorsConfig, layout: RotorLayout, dt_s: float) -> None:
         self._factor = config.thrust_curve
@@ -105,7 +93,6 @@ class Rotors:
         Args:
             each_n: thrust of each rotor; PX4's attitude loop compensates for differences between the rotors.
             full_n: thrust of one rotor at full signal and the present voltage.
-            thr_mdl_fac: PX4's THR_MDL_FAC.
         """
         signals = (motor_signal(each_n / (gain * full_n), self._factor) for gain in self._gain)
         return sum(thrust_share(signal, thr_mdl_fac) for signal in signals) / len(self._gain)
@@ -126,7 +113,6 @@ class Rotors:
         axis.
 
         Args:
-            thrust_n: thrust of all rotors.
             airspeed_m_s: velocity of the air relative to the vehicle, world frame.
             q: position and attitude of the base, as MuJoCo's qpos.
         """

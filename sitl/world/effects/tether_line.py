@@ -43,7 +43,6 @@ def hanging(level_m: float, height_m: float, length_m: float, weight_n_m: float)
         level_m: horizontal distance from the anchor to the upper end.
         height_m: height of the upper end above the anchor.
         length_m: length of the line, longer than the distance between its ends.
-        weight_n_m: weight per length.
     """
     h = max(height_m, 0.0)
     if length_m >= level_m + h:
@@ -76,10 +75,7 @@ class TetherLine:
     """The slack tether.
 
     Args:
-        config: section `tether_line`.
-        tether: tether of the vehicle file.
         taut: that tether in the model, which knows its attachment and present length.
-        bodies: the model of the scene.
     """
 
     def __init__(self, config: TetherLineConfig, tether: Tether, taut: TautTether, bodies: Bodies) -> None:

@@ -17,12 +17,7 @@ _STREAM = 17
 
 
 class Thrower:
-    """Draws the errors of each throw.
-
-    Args:
-        config: section `thrower`.
-        seed: seed of the world.
-    """
+    """Draws the errors of each throw."""
 
     def __init__(self, config: ThrowerConfig, seed: int) -> None:
         self._config = config

@@ -50,7 +50,6 @@ class Transmission:
         outer_rad_per_nm: compliance between the encoder and the base or the link.
         outer_relaxation_s: damping of that outer part divided by its stiffness.
         start_rad: angle of the link at the start; the gear is in the middle of its backlash.
-        dt_s: physics step.
     """
 
     def __init__(
@@ -81,9 +80,7 @@ class Transmission:
         self._torque_share = self._friction_share = 1.0
 
     def stiffness(self) -> tuple[float, float]:
-        """Return the stiffness relative to the physics step, kg m^2 (below 4 times the inertia, an oscillator is stable), and the
-        rotor's inertia, kg m^2.
-        """
+        """Return the stiffness relative to the physics step (stable below 4 times the inertia) and the rotor's inertia, kg m^2."""
         dt_s = self._dt_s
         return dt_s * (self._stiffness_nm * dt_s + 2.0 * self._damping_nms), self._armature_kg_m2
 
@@ -185,10 +182,8 @@ def added_inertia_kg_m2(model: mujoco.MjModel, at_q: int, at_v: int, transmissio
     the links are heavy enough, as those of the shipped arm are.
 
     Args:
-        model: the scene.
         at_q: index of the vehicle's first element in qpos; its joint angles follow the pose of the base.
         at_v: index of the vehicle's first element in qvel.
-        transmissions: transmission of each joint.
     """
     data, poses = mujoco.MjData(model), np.random.default_rng(0)
     stiffness, rotor = np.array([each.stiffness() for each in transmissions]).T
