@@ -74,6 +74,15 @@ def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
         yield sandbox
 
 
+@pytest.fixture(scope="module")
+def short_wait() -> Iterator[None]:
+    """The wait of a flight before its take-off is short: nothing but noise happens meanwhile."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("companion.model.flight_stage.TARE_S", 0.1)
+        patched.setattr("companion.mission.settled.SETTLED_S", 0.1)
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _nothing_is_hoarded(request: pytest.FixtureRequest) -> Iterator[None]:
     """What a file's tests share by `@cache`, whole flights mostly, goes with its last test: it would weigh on every test after them."""
