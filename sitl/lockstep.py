@@ -23,6 +23,10 @@ PATIENCE_S: Final = 2.0
 counted in pieces of `_LOOK_S` that the world itself has run: a computer that stands still stops both.
 """
 _LOOK_S: Final = 0.1
+STARTING_SPEED: Final = 0.1
+"""Simulated seconds in a second of real time while a process of the flight still starts: nobody needs what the world does, and each
+process would start later beside a busy one.
+"""
 CATCH_UP_S: Final = 0.03
 """A world that is further behind its pace does not catch up."""
 _EPSILON_S: Final = 1e-9
@@ -81,6 +85,11 @@ class Process:
     def bus_bytes(self) -> int:
         """Bytes that it had written to the servo bus at its last report."""
         return 0 if self._report is None else self._report.bus_bytes
+
+    @property
+    def starts(self) -> bool:
+        """Whether it has not reported yet."""
+        return self._report is None and not self.ended
 
     @property
     def busy(self) -> bool:
@@ -176,7 +185,7 @@ class TimeKeeper:
     def __init__(self, machines: Sequence[MachineTime], speed: float) -> None:
         self.machines = tuple(machines)
         self._processes = [process for machine in machines for process in machine.processes.values()]
-        self._speed = speed
+        self._speed, self._starting_speed = speed, STARTING_SPEED
         self._from: tuple[float, float] | None = None
         """Simulated time and wall time from which the pace is kept."""
 
@@ -206,8 +215,8 @@ class TimeKeeper:
         return begins
 
     def limit_to_real_time(self) -> None:
-        """Never run faster than real time."""
-        self._speed = min(1.0, self._speed)
+        """Run at real time until the flight begins, and never faster."""
+        self._speed, self._starting_speed = min(1.0, self._speed), 1.0
 
     def set(self, now_s: float) -> None:
         """Set the simulated time, which may jump."""
@@ -253,6 +262,8 @@ class TimeKeeper:
         # Before the flight begins MAVSDK connects, which lives on the computer's clock and is impatient.
         wanted = max(1.0, self._speed) if now_s < 0.0 else self._speed
         speed = wanted if all(process.hurried for process in processes) else min(1.0, wanted)
+        if now_s < 0.0 and any(process.starts for process in processes):
+            speed = min(speed, self._starting_speed)
         if math.isinf(speed):
             self._from = None
             return

@@ -61,8 +61,10 @@ def pytest_configure() -> None:
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Return the number of workers of `pytest -n auto`: three on each processor, because many tests wait for other processes."""
-    return 3 * len(os.sched_getaffinity(0))
+    """Return the number of workers of `pytest -n auto`: two on each processor, because many tests wait for other processes. Each more
+    takes ten seconds of CPU time to collect the tests and to import what they need.
+    """
+    return 2 * len(os.sched_getaffinity(0))
 
 
 @pytest.fixture
@@ -70,6 +72,15 @@ def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
     """A place to run `companion` in."""
     with sandbox_in(tmp_path) as sandbox:
         yield sandbox
+
+
+@pytest.fixture(scope="module")
+def short_wait() -> Iterator[None]:
+    """The wait of a flight before its take-off is short: nothing but noise happens meanwhile."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("companion.model.flight_stage.TARE_S", 0.1)
+        patched.setattr("companion.mission.settled.SETTLED_S", 0.1)
+        yield
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -81,8 +92,9 @@ def _nothing_is_hoarded(request: pytest.FixtureRequest) -> Iterator[None]:
             shared.cache_clear()
 
 
-_WHOLE_FLIGHTS = {"commissioning", "core", "flights", "launcher", "recorder", "sitl"}
-"""Folders of tests that fly: their files take longest."""
+_TESTS = Path(__file__).parent
+_LONG = ("project", "launcher", "flights", "sitl", "plugins", "gym", "core", "preflight", "commissioning", "recorder")
+"""Folders whose files take longest, in the order in which they begin: whole flights, and the checks of all files."""
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -102,14 +114,14 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Let one worker run the tests that share a fixture of their module, so that it is made once. Begin long files early, each beside a
-    quick one: at the end no worker waits for another.
+    """Let one worker run the tests of a file, so that what they share is made once. Begin long files early, each beside a quick one: at
+    the end no worker waits for another.
     """
     files: dict[Path, list[pytest.Item]] = {}
     for item in items:
         files.setdefault(item.path, []).append(item)
-    long = [of for path, of in files.items() if _WHOLE_FLIGHTS & set(path.parts)]
-    quick = [of for path, of in files.items() if not _WHOLE_FLIGHTS & set(path.parts)]
+    long = [of for folder in _LONG for path, of in files.items() if path.is_relative_to(_TESTS / folder)]
+    quick = [of for of in files.values() if of not in long]
     nothing: list[pytest.Item] = []
     items[:] = [item for both in itertools.zip_longest(long, quick, fillvalue=nothing) for of in both for item in of]
     for item in items:

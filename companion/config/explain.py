@@ -42,6 +42,28 @@ def schema_of(model: type[Model]) -> _Node:
 
 def validate(model: type[M], document: Document) -> M | None:
     """Build a model from a document. If there are problems, append them to `document.problems` and return None."""
+    built, error = _built(model, document)
+    found = [] if error is None and not _has_booleans(document.data) else _found(model, document, error)
+    reported = {(problem.origin, problem.text.split(": ")[0]) for problem in document.problems}
+    document.problems += [problem for problem in found if (problem.origin, problem.text.split(": ")[0]) not in reported]
+    return None if document.problems else built
+
+
+def _built(model: type[M], document: Document) -> tuple[M | None, ValidationError | None]:
+    try:
+        return model.model_validate_json(json.dumps(document.data), strict=True), None
+    except ValidationError as error:
+        return None, error
+
+
+def _has_booleans(data: Data) -> bool:
+    if isinstance(data, dict):
+        return any(map(_has_booleans, data.values()))
+    return any(map(_has_booleans, data)) if isinstance(data, list) else isinstance(data, bool)
+
+
+def _found(model: type[Model], document: Document, error: ValidationError | None) -> list[Problem]:
+    """Return the problems of a document. This needs the schema: a document without problems does not wait for it."""
     schema = schema_of(model)
     found = [
         # In JSON `true` equals the constant 1.
@@ -49,14 +71,7 @@ def validate(model: type[M], document: Document) -> M | None:
         for at, node, value in values(schema, document.data)
         if isinstance(value, bool) and node is not None and ("const" in node or "enum" in node)
     ]
-    try:
-        built = model.model_validate_json(json.dumps(document.data), strict=True)
-    except ValidationError as error:
-        found += _problems(error, schema, document)
-        built = None
-    reported = {(problem.origin, problem.text.split(": ")[0]) for problem in document.problems}
-    document.problems += [problem for problem in found if (problem.origin, problem.text.split(": ")[0]) not in reported]
-    return None if document.problems else built
+    return found + ([] if error is None else _problems(error, schema, document))
 
 
 def _problems(error: ValidationError, schema: _Node, document: Document) -> list[Problem]:

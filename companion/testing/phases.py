@@ -9,6 +9,7 @@ from pathlib import Path
 
 from companion.config.loader import FlightConfig, load_flight
 from companion.control.arm_model import manipulator_of
+from companion.control.manipulator import Manipulator
 from companion.mission.air import Air, Expectation, Observation
 from companion.mission.check import check_mission
 from companion.mission.phase import Phase, phases_of
@@ -72,9 +73,10 @@ def _flown(config: FlightConfig, plan: Plan, phase: Phase, segment: Segment, lab
     """Return the states and the reports of a phase for random inputs, the same on every call."""
     history: list[object] = []
     own: Record | None = None
+    manipulator, safe = manipulator_of(config.vehicle), SafeSet(config.vehicle)
     at_s = segment.start_s
     for k, observation in enumerate(_random_observations(plan, segment)):
-        air = _Tick(config, plan, segment, observation, at_s)
+        air = _Tick(config, plan, segment, observation, manipulator, safe, at_s)
         own = phase.begin(air) if k == 0 else phase.step(air, own)
         history += [own, *air.reports]
         if own is None:
@@ -120,12 +122,18 @@ class _Tick(Air):
     """A tick in which the plan's time passes, unless the phase holds or moves it."""
 
     def __init__(
-        self, config: FlightConfig, plan: Plan, engaged: Segment, observation: Observation, at_s: float
+        self,
+        config: FlightConfig,
+        plan: Plan,
+        engaged: Segment,
+        observation: Observation,
+        manipulator: Manipulator,
+        safe: SafeSet,
+        at_s: float,
     ) -> None:
-        vehicle, phases = config.vehicle, phases_of(config.mission)
-        limits, safe = config.mission.limits, SafeSet(vehicle)
-        segment = plan.segment(at_s)
-        super().__init__(observation, vehicle, manipulator_of(vehicle), phases, segment, engaged, limits, safe, True)
+        vehicle, mission, segment = config.vehicle, config.mission, plan.segment(at_s)
+        phases, limits = phases_of(mission), mission.limits
+        super().__init__(observation, vehicle, manipulator, phases, segment, engaged, limits, safe, True)
         self._plan = plan
         self.at_s = at_s
         self.reports: list[object] = []

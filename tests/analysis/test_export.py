@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pandas
 import pytest
 
 from companion.analysis.log import FlightLog
 from companion.cli.main import main
 from tests.analysis.synthetic_flight import record_flight
+
+
+@pytest.fixture(scope="module")
+def pandas() -> Any:
+    """The library. Not at the top: every worker reads this file, and one needs it."""
+    return importlib.import_module("pandas")
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +30,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_a_table_holds_the_log_with_units_and_rate(path: Path, tmp_path: Path, suffix: str) -> None:
+def test_a_table_holds_the_log_with_units_and_rate(pandas: Any, path: Path, tmp_path: Path, suffix: str) -> None:
     assert main(["export", str(path), "--format", suffix, "--out", str(tmp_path)]) == 0
     about = json.loads((tmp_path / "columns.json").read_text(encoding="utf-8"))["tables"]
     for topic, wanted in FlightLog.read(path).to_pandas().items():
@@ -41,7 +48,9 @@ def test_a_table_holds_the_log_with_units_and_rate(path: Path, tmp_path: Path, s
     assert about[f"outputs.{suffix}"]["columns"]["arm_torque_nm[0]"] == {"unit": "N m", "frame": None}
 
 
-def test_a_dataset_has_the_layout_of_lerobot_and_the_values_of_the_logs(path: Path, tmp_path: Path) -> None:
+def test_a_dataset_has_the_layout_of_lerobot_and_the_values_of_the_logs(
+    pandas: Any, path: Path, tmp_path: Path
+) -> None:
     second = tmp_path / "B" / "flight.mcap"
     second.parent.mkdir()
     shutil.copy(path, second)
@@ -104,7 +113,7 @@ def test_what_cannot_be_exported_is_refused_in_one_line(
         assert reason in err
 
 
-def test_lerobot_reads_the_dataset(path: Path, tmp_path: Path) -> None:
+def test_lerobot_reads_the_dataset(pandas: Any, path: Path, tmp_path: Path) -> None:
     """Where LeRobot's package is installed, which needs PyTorch."""
     datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="LeRobot is not installed")
     assert main(["export", str(path), str(path), "--format", "lerobot", "--out", str(tmp_path / "set")]) == 0

@@ -132,7 +132,7 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-FROM_A_SHELL = ("no command", "bad preset", "a world of a bad mission")
+FROM_A_SHELL = ("no command", "a world of a bad mission")
 
 
 @pytest.mark.parametrize("case", [case for case in COMMAND_LINES if case != "a world of a bad mission"])

@@ -1,8 +1,7 @@
 """Devices that are not there or not as they must be, on the hardware path: `companion fly` without --sitl against a simulated
 world that runs on its own. Each time: exit 3, one clear line, never armed, nothing left, and everything free for the next attempt.
 
-The force sensor (before the refused start at the end) has a whole `fly`; the lines of the rest are read where a program opens its
-devices, in this process.
+The force sensor has a whole `fly`; the lines of the rest are read where a program opens its devices, in this process.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import pytest
 import serial
@@ -103,18 +101,7 @@ def test_names_what_is_wrong_with_each_device_and_leaves_no_port_open(world: Wor
         pass
 
 
-def test_refuses_a_start_other_than_the_missions_though_it_refused_before(
-    sandbox: Sandbox, world: World, tmp_path: Path
-) -> None:
-    """The force sensor's port is wrong first. Then the arm and the vehicle both stand elsewhere: one line for each, and no other."""
-    with sandbox_in(tmp_path / "refused") as its:
-        ended = refused(its, world, *world.addresses(force=FORCE_PORT.but))
+def test_a_flight_whose_force_sensor_is_missing_is_refused(sandbox: Sandbox, world: World) -> None:
+    """A start other than the mission's: tests/preflight/test_check_wires.py."""
+    ended = refused(sandbox, world, *world.addresses(force=FORCE_PORT.but))
     assert len(ended.err_lines) == 1 and re.search(FORCE_PORT.line, ended.err_lines[0]), ended.err
-    start = {"mission.start.arm_deg": [150.0, 140.0], "mission.start.position_m": [-0.5, 0.0]}
-    ended = refused(sandbox, world, *world.addresses(), *set_options(**start))
-    assert len(ended.err_lines) == 2, ended.err
-    for pattern in (
-        r"^arm at the start: \(165, 140\) deg, wanted \(150, 140\) ± 10 deg; move the arm there by hand",
-        r"^start position in the motion-capture axes: \(-1\.0\d, -?0\.0\d\) m, 0\.50 m away, wanted \(-0\.5, 0\) m, .*; carry the",
-    ):
-        assert [line for line in ended.err_lines if re.search(pattern, line)], (pattern, ended.err)

@@ -113,6 +113,7 @@ BAD_MISSION = [
         ],
     ),
     ("schema_version: 1", "schema_version: 2", [f"{CATCH}:6:17: schema_version: expected 1, got 2"]),
+    ("schema_version: 1", "schema_version: true", [f"{CATCH}:6:17: schema_version: expected 1, got true"]),
     (
         "{law: adaptive, preset: recommended}",
         "{file: ../controllers/none.yaml}",

@@ -29,6 +29,8 @@ from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from tests.flights.ends import after, contact_over, flown_until
 
+pytestmark = pytest.mark.usefixtures("short_wait")
+
 PRESS = "configs/missions/press.yaml"
 SHORT = (
     "mission.start.position_m=[0.4,0.0]",

@@ -30,6 +30,8 @@ from sitl.fast.result import FastResult
 from tests.control.states import ZERO, at, at_rest
 from tests.flights.ends import after, contact_over, flown_until
 
+pytestmark = pytest.mark.usefixtures("short_wait")
+
 SLIDE = "configs/missions/slide.yaml"
 ARM: Joints = (1.1, 1.4)
 """The arm stretched forward."""

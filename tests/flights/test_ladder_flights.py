@@ -310,7 +310,6 @@ def test_no_command_answers_a_state_that_is_older_than_it_may_be(part: str) -> N
 
 
 def test_the_same_inputs_give_the_same_outputs_bit_for_bit_also_through_a_retract() -> None:
-    """Through a hold: tests/core/test_verdict.py."""
     flight, result = retracted()
     core = FlightCore(flight.config)
     for i, o in zip(result.inputs, result.outputs, strict=True):

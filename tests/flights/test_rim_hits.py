@@ -15,7 +15,7 @@ from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
 from tests.flights.ends import after
 from tests.flights.test_fast_flights import event_ids
-from tests.support import CATCH
+from tests.support import CATCH, SHORT_CATCH
 
 UNTIL_S = 9.0
 """Mission time, 2.5 s after the expected catch."""
@@ -38,8 +38,8 @@ def test_a_ball_that_fell_off_the_rim_is_not_reported_as_caught() -> None:
 
 @pytest.mark.parametrize("payload_kg", [0.05, 0.5])
 def test_the_lightest_and_the_heaviest_payload_are_reported(payload_kg: float) -> None:
-    changes = ["world.seed=2001", f"world.payload_kg={payload_kg}"]
-    flight = FastFlight(load_sitl(CATCH, overrides=changes, world="lab"))
+    changes = ["world.seed=2003", f"world.payload_kg={payload_kg}"]
+    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=changes, world="lab"))
     result = flight.run(until=after("catch"))
     (event,) = [event for o in result.outputs for event in o.events if event.id == "catch"]
     assert event.t_s == pytest.approx(flight.plant.scene.payload.caught_t_s, abs=0.05)

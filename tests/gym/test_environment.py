@@ -21,18 +21,13 @@ from sitl.fast.loop import FastFlight
 from sitl.gym.environment import FlightEnvironment
 from tests.support import SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_wait")  # every reset flies it
+
 
 def made(name: str, **settings: Any) -> FlightEnvironment:
     environment = gymnasium.make(name, **settings).unwrapped
     assert isinstance(environment, FlightEnvironment)
     return environment
-
-
-@pytest.fixture(autouse=True)
-def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The wait before take-off, which every reset flies, is short."""
-    monkeypatch.setattr("companion.model.flight_stage.TARE_S", 0.1)
-    monkeypatch.setattr("companion.mission.settled.SETTLED_S", 0.1)
 
 
 def test_the_environment_keeps_the_rules_of_gymnasium() -> None:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from minsnap_trajectories import Waypoint, generate_trajectory
 from numpy.polynomial import Polynomial
 
 from companion.mission.minsnap import (
@@ -102,6 +101,9 @@ def test_a_path_without_a_duration_uses_its_limits_and_keeps_them(
 @costly
 @given(ways())
 def test_a_path_is_the_one_that_minsnap_trajectories_finds(points_m: tuple[Vec3, ...]) -> None:
+    # Here, not above: every worker reads this file, one needs the library, and SciPy with it.
+    from minsnap_trajectories import Waypoint, generate_trajectory
+
     shares = tuple(0.3 + 0.17 * index for index in range(len(points_m) - 1))
     rest = np.zeros(3)
     at_rest = {"velocity": rest, "acceleration": rest, "jerk": rest}

@@ -26,11 +26,6 @@ def test_a_law_of_the_companion_keeps_the_contract_with_any_arm(law: str, joints
     check_law(law, PRESETS[law][-1], vehicle)
 
 
-@pytest.mark.parametrize("law", ["csc", "psc"])
-def test_a_law_of_the_companion_completes_the_catch(law: str) -> None:
-    check_catch(law, mission=SHORT_CATCH)
-
-
 HEAD = "import math, random\nfrom msgspec.structs import force_setattr, replace\n"
 INTEGRAL = "self.i = getattr(self, 'i', 0.0) + {when} * dt_s * (reference.position_world_m[{axis}] - state.position_world_m[{axis}])"
 BROKEN = [

@@ -5,6 +5,7 @@ right rows, and refuses.
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import os
 import signal
@@ -13,11 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
+from companion.cli.check import show
+from companion.model.check_row import Row
+from companion.model.codec import from_jsonable
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
 from companion.preflight import evaluation, frames, mocap
 from companion.px4 import required
 from companion.px4.versions import has
+from companion.sitl_config.loader import load_sitl
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel, ServoRefusal
 from sitl.servo.protocol import StatusError
@@ -66,18 +72,18 @@ def test_a_sound_world_may_fly_and_every_row_is_reported(sandbox: Sandbox) -> No
     assert all(row["read"] and row["why"] for row in rows.values())
 
 
-def test_a_wrong_setting_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_path: Path) -> None:
-    """Joint angle, force bias, and two parameters and the kill switch of PX4, in the world alone: the companion believes its
-    files.
-    """
+def test_a_wrong_setting_refuses_the_flight(sandbox: Sandbox, tmp_path: Path) -> None:
+    """Joint angle, force bias, and two parameters and the kill switch of PX4, in the world alone, and another start in the mission."""
     wrong = (
         "mission.start.arm_deg=[140, 120]",
         "world.force_bias_n=[30, 0, 0]",
         "world.px4_params={COM_OBL_RC_ACT: 0, EKF2_EV_CTRL: 0}",
         "world.faults=[{kind: kill_switch, after: start, t_s: 0}]",
     )
+    elsewhere = set_options(**{"mission.start.position_m": [-0.5, 0.0]})
     expected = {
         "mission.arm",
+        "frames.place",
         "force.tare",
         "px4.param.COM_OBL_RC_ACT",
         "px4.param.EKF2_EV_CTRL",
@@ -85,17 +91,13 @@ def test_a_wrong_setting_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_
         "px4.kill_switch",
     }
     with sandbox_in(tmp_path / "world") as around, World(around, CATCH, wrong) as world:
-        shown = sandbox.run("check", CATCH, *world.addresses())
-        assert (shown.code, shown.err) == (EXIT_REFUSED, ""), shown
-        assert "the vehicle may not fly." in shown.out
-        assert "-> set COM_OBL_RC_ACT to 4" in shown.out
-
-        flown = sandbox.run("fly", CATCH, "--out", "out", *world.addresses())
+        flown = sandbox.run("fly", CATCH, "--out", "out", *world.addresses(), *elsewhere)
         assert flown.code == EXIT_REFUSED, flown
         assert (world.armings, world.crashes) == (0, 0)
     sandbox.assert_nobody_left()
     for start in (
         "arm at the start: (140, 120) deg, wanted (165, 140)",
+        "start position in the motion-capture axes: (-1.0",
         "force sensor tare: (",
         "COM_OBL_RC_ACT: 0, wanted 4; set",
         "EKF2_EV_CTRL: 0, wanted 11 or 15; set EKF2_EV_CTRL to 11 (companion px4 params --write)",
@@ -108,6 +110,15 @@ def test_a_wrong_setting_refuses_the_check_and_the_flight(sandbox: Sandbox, tmp_
     assert expected <= refusing(rows) and len(flown.err_lines) == len(refusing(rows)), flown.err
     follows = refusing(rows) - expected
     assert all(name.startswith(("px4.", "frames.")) for name in follows), f"not of an estimate without poses: {follows}"
+    printed = io.StringIO()
+    show(
+        Console(file=printed, width=200),
+        [from_jsonable(Row, row) for row in rows.values()],
+        load_sitl(CATCH),
+        simulated=False,
+    )
+    assert "the vehicle may not fly." in printed.getvalue()
+    assert "-> set COM_OBL_RC_ACT to 4" in printed.getvalue()
     assert "(140, 120) deg" in rows["mission.arm"]["read"]
     assert rows["force.tare"]["read"].startswith("(30.0, ")
     assert rows["px4.param.COM_OBL_RC_ACT"]["fix"].startswith("set COM_OBL_RC_ACT to 4")

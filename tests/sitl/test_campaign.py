@@ -276,18 +276,6 @@ def test_a_draw_is_flown_again_as_a_case(place: Sandbox, monkeypatch: pytest.Mon
     assert {**case, "name": "", "number": 0} == {**draw, "name": ""}
 
 
-def test_a_fault_is_flown_by_a_campaign(place: Sandbox, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(place.cwd)
-    ended = run_here("faults", SHORT_CATCH, "--kinds", "kill_flight", "--phases", "takeoff", "--json", "--out", "fault")
-    assert ended.code == EXIT_OK, ended.err
-    table = json.loads(ended.out)
-    assert table["summary"]["bad"] == 0
-    (row,) = table["rows"]
-    assert (row["fault"], row["phase"], row["outcome"]) == ("kill_flight", "takeoff", "landed")
-    for key in ("size", "detected_s", "action", "worst_tilt_deg", "min_height_m", "min_slack_m"):
-        assert key in row
-
-
 @contextlib.contextmanager
 def terminal() -> Iterator[tuple[int, bytearray]]:
     """A terminal: the end for a program, and what that has shown."""

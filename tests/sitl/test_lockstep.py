@@ -10,6 +10,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 
 import pytest
 
@@ -121,6 +122,22 @@ def test_a_process_that_ends_is_not_waited_for(pair: Pair) -> None:
     advance(pair, 0.002)
     ends.join()
     assert pair.keeper.machines[0].processes["flight"].ended
+
+
+def test_the_world_is_slow_until_every_process_has_started(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+
+    async def sleep(delay_s: float) -> None:
+        slept.append(delay_s)
+
+    monkeypatch.setattr(lockstep, "time", SimpleNamespace(monotonic=lambda: 5.0))
+    monkeypatch.setattr(lockstep, "asyncio", SimpleNamespace(sleep=sleep))
+    advance(pair, -2.0)
+    advance(pair, -1.998)
+    assert slept == [pytest.approx(0.02)]
+    pair.report(9.0)
+    advance(pair, -1.996)
+    assert len(slept) == 1
 
 
 def test_without_a_world_time_follows_the_computers_clock(pair: Pair) -> None:

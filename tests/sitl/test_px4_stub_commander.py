@@ -96,21 +96,6 @@ def test_disarming_in_the_air_needs_force(health: Health, magic: float, result: 
 
 
 @pytest.mark.parametrize(
-    ("command", "params", "result"),
-    [
-        (Command.COMPONENT_ARM_DISARM, (2.0,), Result.UNSUPPORTED),
-        (Command.DO_SET_MODE, (1.0, math.nan, math.nan), Result.DENIED),
-        (Command.DO_SET_MODE, (1.0, 4.0, 7.0), Result.TEMPORARILY_REJECTED),
-        (31000, (), Result.UNSUPPORTED),
-    ],
-)
-def test_a_command_without_a_meaning_changes_nothing(command: int, params: tuple[float, ...], result: Result) -> None:
-    it = commander()
-    assert ask(it, command, *params) is result
-    assert not it.armed and it.user_intention is NavState.LOITER
-
-
-@pytest.mark.parametrize(
     ("state", "health", "result"),
     [
         (NavState.LAND, FLYING, Result.ACCEPTED),
@@ -131,32 +116,6 @@ def test_in_flight_a_mode_that_cannot_run_is_refused(state: NavState, health: He
         assert it.nav_state is state
     else:
         assert it.user_intention is NavState.TAKEOFF
-
-
-@pytest.mark.parametrize(
-    ("command", "params", "state"),
-    [
-        (Command.NAV_TAKEOFF, (), NavState.TAKEOFF),
-        (Command.NAV_LAND, (), NavState.LAND),
-        (Command.NAV_RETURN_TO_LAUNCH, (), NavState.RTL),
-        (Command.DO_REPOSITION, (-1.0, 1.0), NavState.LOITER),
-        (Command.DO_FLIGHTTERMINATION, (1.0,), NavState.TERMINATION),
-    ],
-)
-def test_commands_that_change_the_mode(command: Command, params: tuple[float, ...], state: NavState) -> None:
-    it = flying(NavState.OFFBOARD)
-    assert ask(it, command, *params, health=FLYING) is Result.ACCEPTED
-    it.update(0.2, FLYING)
-    assert it.nav_state is state
-
-
-def test_nothing_leads_out_of_termination() -> None:
-    it = flying(NavState.OFFBOARD)
-    ask(it, Command.DO_FLIGHTTERMINATION, 1.0, health=FLYING)
-    it.update(0.2, FLYING)
-    assert set_mode(it, NavState.LAND, FLYING) is Result.TEMPORARILY_REJECTED
-    it.update(0.3, FLYING)
-    assert it.nav_state is NavState.TERMINATION
 
 
 @pytest.mark.parametrize(
@@ -182,14 +141,6 @@ def test_offboard_loss_leads_to_com_obl_rc_act(action: int, health: Health, stat
     assert it.notices[-1].text.startswith("Failsafe activated")
 
 
-def test_offboard_returns_with_its_setpoints() -> None:
-    it = flying(NavState.OFFBOARD, COM_OBL_RC_ACT=4)
-    it.update(1.0, replace(FLYING, setpoint_age_s=1.0))
-    it.update(1.1, FLYING)
-    assert it.nav_state is NavState.OFFBOARD
-    assert it.failsafe is False
-
-
 def test_after_landing_px4_disarms_and_is_back_in_offboard() -> None:
     it = flying(NavState.OFFBOARD)
     set_mode(it, NavState.LAND, FLYING)
@@ -201,16 +152,6 @@ def test_after_landing_px4_disarms_and_is_back_in_offboard() -> None:
     assert not it.armed
     assert it.nav_state is NavState.OFFBOARD
     assert it.notices[-1].text == "Disarmed by landing"
-
-
-def test_without_a_take_off_it_disarms_after_com_disarm_prflt() -> None:
-    it = commander()
-    ask(it, Command.COMPONENT_ARM_DISARM, 1.0)
-    it.update(0.0, GOOD)
-    it.update(9.9, GOOD)
-    assert it.armed
-    it.update(10.0, GOOD)
-    assert not it.armed
 
 
 def test_a_kill_disarms_after_com_kill_disarm_and_forbids_arming() -> None:

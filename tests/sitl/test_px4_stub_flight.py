@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from functools import cache
 
 import pytest
@@ -13,7 +12,7 @@ from sitl.autopilot.modes import NavState
 from sitl.autopilot.origin import Origin
 from sitl.autopilot.setpoints import PositionTarget, RateTarget
 from sitl.autopilot.types import AttitudeTarget
-from tests.sitl.px4_rig import PERIOD_S, Rig
+from tests.sitl.px4_rig import Rig
 
 HOVER = 0.5
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -62,39 +61,6 @@ def stream(rig: Rig, duration_s: float, target: AttitudeTarget | RateTarget | Po
             rig.stub.on_setpoint(rig.t_s, target)
             due_s += 0.02
         rig.step()
-
-
-def test_take_off_hold_land_and_automatic_disarm() -> None:
-    rig = hovering()
-    rig.run(3.0)
-    assert rig.stub.nav_state is NavState.LOITER
-    x, y, z = rig.plant.position_ned_m
-    assert math.hypot(x, y) < 0.05
-    assert z == pytest.approx(-1.0, abs=0.1)
-    rig.command(Command.NAV_LAND)
-    fastest = 0.0
-    start_s = rig.t_s
-    while rig.stub.armed:
-        rig.step()
-        fastest = max(fastest, rig.plant.velocity_ned_m_s[2])
-        assert rig.t_s - start_s < 20.0
-    assert 0.6 < fastest < 0.85, "MPC_LAND_SPEED is 0.7"
-    assert rig.stub.rotors == (0.0, 0.0, 0.0, 0.0)
-    assert rig.height_m == pytest.approx(0.0, abs=1e-6)
-    assert rig.texts() == ["Landing detected", "Disarmed by landing"]
-
-
-def test_setpoints_act_after_the_configured_delay() -> None:
-    rig = Rig(setpoint_delay_s=0.02)
-    rig.run(0.5)
-    stream(rig, 0.2, AttitudeTarget(LEVEL, 0.05))
-    rig.mode(6)
-    rig.arm()
-    stream(rig, 0.1, AttitudeTarget(LEVEL, 0.05))
-    rig.run(0.04)
-    rig.stub.on_setpoint(rig.t_s, AttitudeTarget(LEVEL, 0.3))
-    took_s = run_until(rig, lambda: rig.stub.target.thrust == 0.3, 1.0)
-    assert took_s == pytest.approx(0.02, abs=PERIOD_S)
 
 
 def test_offboard_follows_position_and_velocity_setpoints() -> None:

@@ -173,21 +173,6 @@ def test_commands_to_the_link_are_answered_as_px4_does() -> None:
     assert rig.stub.nav_state is NavState.LOITER
 
 
-def test_ping_timesync_and_file_requests_are_answered() -> None:
-    rig = Rig()
-    wire = Wire(rig)
-    rig.run(0.5)
-    wire.deliver(mavlink.MAVLink_ping_message(123, 7, 0, 0))
-    wire.deliver(mavlink.MAVLink_timesync_message(0, 456))
-    wire.deliver(mavlink.MAVLink_timesync_message(789, 456))
-    wire.deliver(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [1, 0, 0, 4, 0] + [0] * 246))
-    ping, sync, refusal = wire.replies
-    assert (ping.get_type(), ping.seq, ping.target_system) == ("PING", 7, 245)
-    assert (sync.get_type(), sync.ts1) == ("TIMESYNC", 456)
-    assert sync.tc1 == pytest.approx(0.5e9, abs=1e7)
-    assert (refusal.get_type(), refusal.payload[3], refusal.payload[5]) == ("FILE_TRANSFER_PROTOCOL", 129, 4)
-
-
 @pytest.mark.parametrize(
     ("message_id", "asked_hz", "expected_hz"),
     [
@@ -223,10 +208,3 @@ def test_every_stream_can_be_encoded() -> None:
         assert message is not None, message_id
         assert message.get_msgId() == message_id
         assert message.pack(encoder)
-
-
-def test_a_stream_that_fell_behind_does_not_burst() -> None:
-    schedule = Schedule(ground=False)
-    schedule.due(0.0)
-    assert schedule.due(5.0).count(mavlink.MAVLINK_MSG_ID_ODOMETRY) == 1
-    assert mavlink.MAVLINK_MSG_ID_ODOMETRY not in schedule.due(5.001)

@@ -9,12 +9,10 @@ import termios
 from typing import Self
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from sitl.servo.bus import ServoBus, ServoLine
 from sitl.servo.model import RAD_PER_COUNT, ServoModel
-from sitl.servo.protocol import HEADER, Instruction, PacketParser, StatusError, packet, status, stuff, unstuff
+from sitl.servo.protocol import Instruction, PacketParser, StatusError, packet, status
 from tests.sitl.test_servo_model import get
 from tests.support import DEADLINE_S
 
@@ -70,14 +68,6 @@ def test_a_sync_read_stops_where_a_servo_is_missing(silent: int | None, sent: st
     assert line.feed(bytes.fromhex(sent)) == bytes.fromhex(answered)
 
 
-def test_stuffing_hides_every_header_and_comes_off_again() -> None:
-    body = b"\xff\xff\xfd\xff\xff\xfd\xfd\xff\xff\xff\xfd\x00"
-    assert HEADER not in stuff(body)
-    assert unstuff(stuff(body)) == body
-    (found,) = PacketParser().feed(packet(1, b"\x03" + body))
-    assert (found.crc_ok, found.instruction, found.parameters) == (True, 3, body)
-
-
 @pytest.mark.parametrize(
     ("body", "error"),
     [
@@ -110,25 +100,6 @@ def test_servo_does_not_hear_another_baud_rate() -> None:
 # --- noise ----------------------------------------------------------------------------------------------------------------
 
 _PING = packet(1, b"\x01")
-
-
-@given(
-    st.sampled_from(list(Instruction)).filter(lambda i: i != Instruction.STATUS) | st.integers(0, 255),
-    st.sampled_from([0, 1, 2, 254]),
-    st.binary(max_size=60),
-)
-def test_random_instructions_never_raise(instruction: int, packet_id: int, parameters: bytes) -> None:
-    line = line_of(ServoModel(1), ServoModel(2))
-    line.feed(packet(packet_id, bytes((instruction,)) + parameters))
-    for servo in line.servos:
-        current = servo.update(0.1, 1.0, 0.5)
-        assert abs(current) <= 1193 * AMP + 1e-9
-
-
-def test_packet_arrives_byte_by_byte() -> None:
-    line = line_of(ServoModel(1))
-    answers = [line.feed(bytes((byte,))) for byte in b"\xff\xff" + _PING]
-    assert [bool(answer) for answer in answers] == [False] * (len(_PING) + 1) + [True]
 
 
 # --- pty ------------------------------------------------------------------------------------------------------------------
@@ -233,14 +204,3 @@ def test_two_servos_with_one_id_answer_at_once_and_the_answer_is_unreadable() ->
 
     line.feed(packet(1, bytes((Instruction.WRITE, 7, 0, 5))))
     assert [servo.servo_id for servo in (first, second, third)] == [5, 5, 2], "both take what is written"
-
-
-def test_status_return_level_silences_writes_then_reads() -> None:
-    line = line_of(ServoModel(1))
-    read = packet(1, bytes((2, 132, 0, 4, 0)))
-    assert line.feed(packet(1, bytes((3, 68, 0, 1)))) == status(1, 0)
-    assert line.feed(packet(1, bytes((3, 65, 0, 1)))) == b""
-    assert line.feed(read) != b""
-    line.feed(packet(1, bytes((3, 68, 0, 0))))
-    assert line.feed(read) == b""
-    assert line.feed(packet(1, b"\x01")) != b""

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.sitl_config.world import World as WorldConfig
-from sitl.world.state import PHYSICS_DT_S
 from tests.sitl.plants import OneMachine, run
-from tests.support import tether_of, tool_of
+from tests.support import tool_of
 
 Array = NDArray[np.float64]
 NO_PAYLOAD = WorldConfig(payload_kg=0.0, joint_friction_nm=0.0, joint_damping_nms=0.0)
@@ -56,19 +55,3 @@ def test_the_catch_conserves_momentum(vehicle: Vehicle, payload_kg: float) -> No
     away = d.xpos[payload] - d.xpos[m.body("net").id]
     assert np.linalg.norm(away) < 1.1 * tool_of(vehicle).radius_m, "the net did not keep the payload"
     assert np.linalg.norm(momentum() - before) <= 0.005 * np.linalg.norm(before)
-
-
-def test_a_taut_tether_pulls_and_a_slack_one_does_not(vehicle: Vehicle) -> None:
-    world = OneMachine(vehicle, NO_PAYLOAD, (0.0, 0.0), 0.0, ARM_START)
-    hover = world.machine.hover_command * 1.3
-    rotors = (hover, hover, hover, hover)
-    tension = []
-    for _ in range(int(2.5 / PHYSICS_DT_S)):
-        world.fly(rotors, (0, 0), False)
-        truth = world.machine.truth()
-        tension.append(truth.tether_tension_n)
-        away = math.dist(truth.position_world_m, tether_of(vehicle).anchor_world_m)
-        assert away < tether_of(vehicle).length_m + 0.1
-        if away < tether_of(vehicle).length_m - 0.05:
-            assert truth.tether_tension_n == 0.0
-    assert max(tension) > 1.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import pytest
@@ -34,16 +33,6 @@ def test_voltage_sags_by_the_resistance_times_the_current(each_n: float) -> None
     battery.step(PHYSICS_DT_S, (each_n,) * 4)
     assert battery.voltage_v * battery.current_a == pytest.approx(15.0 + 4.0 * 3.9 * each_n**1.5)
     assert battery.voltage_v == pytest.approx(open_circuit_v(1.0, 4) - 0.03 * battery.current_a)
-
-
-def test_charge_drawn_is_the_integral_of_the_current() -> None:
-    battery, drawn_as = pack(start=0.9), 0.0
-    for step in range(1000):
-        each_n = 7.0 + 3.0 * math.sin(0.01 * step)
-        battery.step(PHYSICS_DT_S, (each_n,) * 4)
-        drawn_as += battery.current_a * PHYSICS_DT_S
-    assert battery.drawn_as == pytest.approx(drawn_as)
-    assert battery.remaining == pytest.approx(0.9 - drawn_as / battery.capacity_as)
 
 
 def test_hovering_empties_the_battery_in_its_life() -> None:

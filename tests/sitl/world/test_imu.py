@@ -94,14 +94,3 @@ def test_the_drift_has_its_spread_and_forgets_with_its_time_constant() -> None:
     assert statistics.pstdev(accel) == pytest.approx(0.5, rel=0.1)
     assert statistics.pstdev(gyro) == pytest.approx(2.0, rel=0.1)
     assert statistics.correlation(accel[4:], accel[:-4]) == pytest.approx(math.exp(-1.0), abs=0.06)
-
-
-def test_the_drift_of_a_flight_depends_on_the_seed_alone() -> None:
-    late, early = (errors(accel_drift_m_s2=0.5) for _ in range(2))
-    for _ in range(70):
-        late.measure(STOPPED, *STILL)
-    for imu in (late, early):
-        imu.drift(noise(3, 11))
-    drifts = [[imu.measure(STOPPED, *STILL) for _ in range(60)] for imu in (late, early)]
-    assert drifts[0] == drifts[1]
-    assert drifts[0][0] != drifts[0][59]

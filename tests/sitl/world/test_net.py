@@ -14,10 +14,8 @@ from companion.config.loader import load_vehicle
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Vec2, Vec3
 from companion.sitl_config.effects.net import Net
-from companion.sitl_config.faults import Fault
 from companion.sitl_config.world import World as WorldConfig
 from sitl.world.effects.net import Bag
-from sitl.world.model import SECOND, SECOND_CATCH
 from sitl.world.payload import Ball
 from sitl.world.state import PHYSICS_DT_S
 from tests.sitl.plants import OneMachine, run
@@ -188,32 +186,3 @@ def test_what_bounces_out_is_an_event_and_no_catch() -> None:
     run(world, 0.6)
     assert [event.kind for event in world.take_events()] == ["bounced_out"]
     assert world.payload.caught_t_s is None
-
-
-def test_a_payload_falls_out_of_the_bag_when_it_is_dropped_and_can_be_thrown_again() -> None:
-    config = WorldConfig(throws=2, keep_s=1.0, net=Net(on=True))
-    world = world_with(config)
-    lay = world.data.xpos[ball_of(world).body].copy()
-    thrown_at(world, ball_of(world), (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
-    run(world, 0.7)
-    assert [event.kind for event in world.take_events()] == ["caught"]
-    world.payload.drop()
-    run(world, 0.25)
-    assert world.data.xpos[ball_of(world).body][2] < 0.06, "on the floor"
-    run(world, 0.35)
-    assert [event.kind for event in world.take_events()] == ["taken"]
-    assert world.data.xpos[ball_of(world).body] == pytest.approx(lay, abs=0.01)
-
-
-def test_two_payloads_lie_in_the_bag() -> None:
-    config = WorldConfig(faults=(Fault(kind="payload_double", t_s=0.0),), net=Net(on=True))
-    world = world_with(config)
-    second = Ball.of(world.model, SECOND, SECOND_CATCH)
-    thrown_at(world, second, (0.02, 0.0, 0.04), (0.0, 0.0, -1.0))
-    thrown_at(world, ball_of(world), (0.0, 0.0, 0.02), (0.0, 0.0, -1.0))
-    assert not world.payload.catch(second, world.t_s)
-    run(world, 3.0)
-    assert world.payload.catch(second, world.t_s)
-    assert world.payload.catches == 1
-    both_n = GRAVITY_M_S2 * (config.payload_kg + config.faults[0].magnitude + tool_of(VEHICLE).beyond_sensor_kg)
-    assert world.machine.truth().force_sensor_n[2] == pytest.approx(-both_n, rel=0.01)
