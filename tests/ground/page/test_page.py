@@ -328,10 +328,11 @@ def test_both_vehicles_of_a_team_are_shown_and_commands_go_to_the_chosen_one(stu
     pictures.append(picture(second=other))
     assert team() == [["false", "second", "HOLDING", ""], ["true", NAME, "FLYING", ""]] and boxes() == before
     assert page.tab.locator("#team [data-vehicle='second'] i").count() == len(in_flight().lights)
-    pictures.append(picture(second={**other, "position_world_m": (1.0, 0.5, 1.5)}))
-    bar = BarView(position_world_m=(0.5, 0.5, 0.8), attitude_wxyz=(1.0, 0.0, 0.0, 0.0))
-    pictures.append(picture(second={**other, "position_world_m": (1.0, 0.5, 1.5), "bar": bar}))
-    assert len(set(pictures)) == 4, "the other vehicle, its motion and its bar are drawn"
+    other["attitude_wxyz"] = (0.6, 0.0, 0.0, 0.8)
+    pictures.append(picture(second=other))
+    other["bar"] = BarView(position_world_m=(0.5, 0.5, 0.8), attitude_wxyz=(1.0, 0.0, 0.0, 0.0))
+    pictures.append(picture(second=other))
+    assert len(set(pictures)) == 4, "the other vehicle, its attitude and its bar are drawn"
 
     page.press("hold")
     page.tab.click("#team [data-vehicle='second']")
