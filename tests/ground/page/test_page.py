@@ -337,6 +337,8 @@ def test_both_vehicles_of_a_team_are_shown_and_commands_go_to_the_chosen_one(stu
     page.press("hold")
     page.tab.click("#team [data-vehicle='second']")
     page.shown = "second"
+    aims = page.tab.locator("#team .aim").all_inner_texts()
+    assert aims == ["commands go here", "choose"], "second is the first in the alphabet"
     assert NAME not in page.text(".command-grid") and page.text("[data-command='hold']").endswith("second")
     page.press("land")
     page.tab.keyboard.press("Shift+A")

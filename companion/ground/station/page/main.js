@@ -118,7 +118,7 @@ function update() {
   const others = new Map(replay === null ? [...vehicles].map(([name, one]) => [name, one === vehicle ? verdict : assess(one, state, now)]) : []);
   const partner = partnerOf(vehicle);
   const members = partner === null ? [] : [vehicle, partner].sort((a, b) => (a.name < b.name ? -1 : 1));
-  team.draw(members.map((one) => ({ vehicle: one, verdict: others.get(one.name), answer: commands.newest(one.name) })), vehicle?.name);
+  team.draw(members.map((one) => ({ vehicle: one, verdict: others.get(one.name), answer: commands.newest(one.name) })), vehicle?.name, Boolean(hello?.can_command));
   topBar.draw({ vehicle, verdict, hello, others, replayName: replay?.name });
   figures.draw(vehicle);
   devices.draw(vehicle);
@@ -166,7 +166,8 @@ function paint() {
     redraw.scene = false;
     sceneDueMs = now + SCENE_MS;
     const partner = partnerOf(vehicle);
-    sceneView.draw(vehicle, partner, partner !== null && assess(partner, linkNow(), now).stale);
+    const { banner, ended, word } = assess(partner, linkNow(), now);
+    sceneView.draw(vehicle, partner, banner?.word ?? (ended ? word : ""));
   }
   if (redraw.plots && now >= plotsDueMs) {
     redraw.plots = false;

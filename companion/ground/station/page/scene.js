@@ -32,8 +32,8 @@ export class SceneView {
     for (const button of this._presets) button.setAttribute("aria-pressed", String(button.dataset.preset === this.camera.preset));
   }
 
-  /** @param partner the other vehicle of a team, or null; @param gone whether its data is stale */
-  draw(vehicle, partner = null, gone = false) {
+  /** @param partner the other vehicle of a team, or null; @param gone why its data is not live, such as STALE, else empty */
+  draw(vehicle, partner = null, gone = "") {
     const fitted = fitCanvas(this.canvas);
     if (fitted === null) return;
     const { context, width, height } = fitted;
@@ -59,13 +59,13 @@ export class SceneView {
       drawTrail(renderer, one.flown());
       if (one.scene.anchor_world_m) drawAnchor(renderer, one.scene);
       const at = one.stream?.position_world_m;
-      if (at) parts.push([renderer.depth(at), () => this._drawVehicle(renderer, one, { chosen: one === vehicle, grey: one === partner && gone })]);
+      if (at) parts.push([renderer.depth(at), () => this._drawVehicle(renderer, one, { chosen: one === vehicle, grey: one === partner && gone !== "" })]);
     }
     const bar = stream?.bar ?? (gone ? null : partner?.stream?.bar);
     if (bar && scene.bar_length_m) parts.push([renderer.depth(bar.position_world_m), () => drawBar(renderer, bar, scene.bar_length_m)]);
     parts.sort((a, b) => b[0] - a[0]).forEach(([, draw]) => draw());
     if (partner === null) return;
-    for (const one of [partner, vehicle]) drawName(renderer, one, one === vehicle, one === partner && gone);
+    for (const one of [partner, vehicle]) drawName(renderer, one, one === vehicle, one === partner ? gone : "");
   }
 
   /** Draw a vehicle that has a position, and the figures beside the chosen one. */
@@ -160,8 +160,9 @@ function drawBar(renderer, { position_world_m: centre, attitude_wxyz: attitude }
 function drawName(renderer, { name, stream }, chosen, gone) {
   const at = stream?.position_world_m;
   if (!at) return;
-  const text = chosen ? `▸ ${name}` : gone ? `${name}: STALE` : name;
-  renderer.text(at, text, { colour: gone ? colours.bad : chosen ? colours.ink : colours.soft, edge: gone ? colours.bad : chosen ? colours.accent : colours.line, size: 13, dy: -46 });
+  const text = chosen ? `▸ ${name}` : [name, gone].filter(Boolean).join(": ");
+  const edge = gone ? colours.bad : chosen ? colours.accent : colours.line;
+  renderer.text(at, text, { colour: chosen ? colours.ink : colours.soft, edge, size: 13, dy: -46 });
 }
 
 const attachment = (scene, position, attitude) => add(position, rotate(attitude, scene.attachment_body_m));

@@ -15,7 +15,7 @@ export class Team {
   }
 
   /** @param members [{vehicle, verdict, answer}] of both, the left one first; empty without a team; @param chosen name of the chosen one */
-  draw(members, chosen) {
+  draw(members, chosen, canCommand) {
     setHidden(byId("team"), members.length === 0);
     setData(document.body, "team", String(members.length > 0));
     members.forEach(({ vehicle, verdict, answer }, index) => {
@@ -26,7 +26,7 @@ export class Team {
       setData(row.button, "gone", String(stale || verdict.ended));
       row.button.setAttribute("aria-pressed", String(vehicle.name === chosen));
       setText(row.name, vehicle.name);
-      setText(row.aim, vehicle.name === chosen ? "commands go here" : "show and command");
+      setText(row.aim, vehicle.name !== chosen ? "choose" : canCommand && !verdict.ended ? "commands go here" : "shown");
       setText(row.word, banner?.word ?? verdict.word);
       setText(row.why, banner?.text ?? verdict.why);
       setText(row.answer, answer === undefined ? "" : `${answer.name}: ${answer.text}`);
