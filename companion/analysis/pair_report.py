@@ -30,6 +30,7 @@ from companion.analysis.scene import FRAME, Camera, Scene, Shape
 from companion.analysis.table import Table, pairs
 from companion.analysis.time_axes import legend, line
 from companion.model.frames import quat_rotate
+from companion.model.logged_geometry import logged_bar_length_m
 
 _SHOWN_S = 16.0
 """Duration of the animation at most; a longer flight is shown faster."""
@@ -132,12 +133,10 @@ def _movie(truth: BarTruth, sides: tuple[Course, Course], t_s: Array, errors: Ar
         return None
     try:
         scenes = [Scene(side.log.config["vehicle"]) for side in sides]
-        length_m = next(
-            float(phase["bar"]["length_m"])
-            for phase in sides[0].log.config["mission"]["phases"]
-            if phase["type"] == "grip"
-        )
-    except (KeyError, TypeError, StopIteration):
+    except (KeyError, TypeError):
+        return None
+    length_m = logged_bar_length_m(sides[0].log.config)
+    if length_m is None:
         return None
     first_s, last_s = min(times[0] for times in flying), max(times[-1] for times in flying)
     start_s = _mission_start_s(sides[0])

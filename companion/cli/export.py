@@ -1,4 +1,4 @@
-"""`companion export`: write logs as CSV or Parquet tables, or as a LeRobot dataset."""
+"""`companion export`: write logs as CSV or Parquet tables, as a LeRobot dataset, or as one file for Foxglove."""
 
 from __future__ import annotations
 
@@ -12,22 +12,24 @@ from companion.analysis.log import FlightLog, LogError
 from companion.cli.report import names_of
 from companion.config.document import ConfigError
 from companion.model.exit_codes import EXIT_OK
+from companion.recorder.viewer_file import write_viewer_file
 
 
 def add_parser(commands: Any) -> None:
     export = commands.add_parser(
         "export",
-        help="write logs as CSV or Parquet tables, or as a LeRobot dataset",
+        help="write logs as CSV or Parquet tables, as a LeRobot dataset, or as one file for Foxglove",
         description="csv, parquet: one table for each of inputs, outputs, sent and events, and columns.json with units and rates. "
-        "lerobot: one dataset (v2.1) with an episode for each log.",
+        "lerobot: one dataset (v2.1) with an episode for each log. foxglove: one file in which Foxglove shows the flights of all logs "
+        "in one scene, such as those of a team.",
     )
     export.add_argument("log", type=Path, nargs="+", help="flight.mcap")
-    export.add_argument("--format", choices=("csv", "parquet", "lerobot"), required=True)
+    export.add_argument("--format", choices=("csv", "parquet", "lerobot", "foxglove"), required=True)
     export.add_argument(
         "--out",
         type=Path,
-        metavar="DIR",
-        help="folder to write to (default: csv, parquet: that of the log; several logs get a folder each)",
+        metavar="PATH",
+        help="folder to write to; foxglove: the file (default: csv, parquet: that of the log; several logs get a folder each)",
     )
     export.set_defaults(run=run)
 
@@ -46,6 +48,16 @@ def run(arguments: argparse.Namespace) -> int:
                 raise ConfigError("companion export: --format lerobot needs --out, the folder of the dataset")
             frames = write_lerobot([FlightLog.read(path) for path in paths], out)
             print(f"{out}: {len(paths)} episodes, {frames} frames")
+            return EXIT_OK
+        if arguments.format == "foxglove":
+            if out is None:
+                raise ConfigError(
+                    "companion export: --format foxglove needs --out, the file to write, such as both.mcap"
+                )
+            out.parent.mkdir(parents=True, exist_ok=True)
+            logs = {name: FlightLog.read(path) for name, path in zip(names_of(paths), paths, strict=True)}
+            write_viewer_file(logs, out)
+            print(out)
             return EXIT_OK
         for path, name in zip(paths, names_of(paths), strict=True):
             folder = path.parent if out is None else out / name if len(paths) > 1 else out

@@ -74,3 +74,11 @@ def _tether(section: dict[str, Any]) -> TetherGeometry:
 def _vec3(values: Any) -> Vec3:
     x, y, z = map(float, values)
     return (x, y, z)
+
+
+def logged_bar_length_m(config: Any) -> float | None:
+    """Return the distance between the handles of the bar that the mission of an effective configuration grips, or None."""
+    try:
+        return next((float(p["bar"]["length_m"]) for p in config["mission"]["phases"] if p["type"] == "grip"), None)
+    except (KeyError, TypeError, ValueError):
+        return None

@@ -22,7 +22,8 @@ from companion.recorder.live_viewers import LiveViewers, in_log
 from companion.recorder.log_file import LogFile
 from companion.recorder.viewer_channels import ViewerChannels, timestamp
 
-_LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "critical": LogLevel.Error}
+LEVELS = {"info": LogLevel.Info, "warning": LogLevel.Warning, "critical": LogLevel.Error}
+"""Level of a line of `/log`, by `companion.model.types.Severity`."""
 _STAMP_MAX_NS = 2**32 * 1_000_000_000 - 1
 """Largest time stamp of a header, whose seconds have 32 bits."""
 _CHUNK_BYTES = 2**19
@@ -128,8 +129,8 @@ class LogWriter:
         self._line(stamp_ns, event.severity.value, event.id, event.text)
 
     def _line(self, stamp_ns: int, severity: str, source: str, text: str) -> None:
-        level = _LEVELS.get(severity, LogLevel.Unknown)
-        line = Log(timestamp=timestamp(stamp_ns), level=level, message=_clean(text), name=_clean(source))
+        level = LEVELS.get(severity, LogLevel.Unknown)
+        line = Log(timestamp=timestamp(stamp_ns), level=level, message=clean(text), name=clean(source))
         self._log.log(line, log_time=stamp_ns)
         self._unflushed_bytes += len(text) + 1
 
@@ -141,6 +142,6 @@ class LogWriter:
         return min(max(0, stamp_ns), _STAMP_MAX_NS)
 
 
-def _clean(text: str) -> str:
+def clean(text: str) -> str:
     """Return text that UTF-8 can encode: text from a device may contain lone surrogates."""
     return text.encode("utf-8", "replace").decode()

@@ -5,7 +5,7 @@
 ``/tf_arm``       foxglove.FrameTransforms    body -> link1 -> ... -> net, 50 Hz
 ``/pose``         foxglove.PoseInFrame        motion capture as received, 50 Hz
 ``/reference``    foxglove.PoseInFrame        reference pose, 50 Hz
-``/scene``        foxglove.SceneUpdate        the tether, and the ball that is seen with where it meets the net, 20 Hz
+``/scene``        foxglove.SceneUpdate        the tether, the ball that is seen with where it meets the net, and the bar, 20 Hz
 ``/scene_path``   foxglove.SceneUpdate        flown and reference path so far, every 2 s
 ``/scene_static`` foxglove.SceneUpdate        room, anchor, planned path, vehicle, arm, net: once, and for a new plan or live viewer
 ================  ==========================  =========================================================================
@@ -41,13 +41,16 @@ from foxglove.messages import (
 from companion.model.arm_skeleton import NO_ARM, ArmSkeleton
 from companion.model.frames import quat_rotate
 from companion.model.hanging_line import hanging_line_m
-from companion.model.logged_geometry import Geometry, logged_geometry
+from companion.model.logged_geometry import Geometry, logged_bar_length_m, logged_geometry
 from companion.model.markers import BallState
 from companion.model.outputs import Outputs, TetherState
+from companion.model.team import BarPose
 from companion.model.types import Inputs, Quat, Reference, Vec3
 from companion.recorder.viewer_scene import (
     BALL,
     BALL_M,
+    BAR,
+    HANDLE_M,
     MEETING,
     path_of,
     point3,
@@ -74,18 +77,24 @@ _STRAIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
 
 
 class ViewerChannels:
-    """Writes the viewer messages of a tick, each at its own rate."""
+    """Writes the viewer messages of a tick, each at its own rate.
 
-    def __init__(self, context: foxglove.Context) -> None:
-        self._tf = FrameTransformChannel("/tf", context=context)
-        self._arm = FrameTransformsChannel("/tf_arm", context=context)
-        self._pose = PoseInFrameChannel("/pose", context=context)
-        self._reference = PoseInFrameChannel("/reference", context=context)
-        self._scene = SceneUpdateChannel("/scene", context=context)
-        self._path = SceneUpdateChannel("/scene_path", context=context)
-        self._static = SceneUpdateChannel("/scene_static", context=context)
+    Args:
+        prefix: beginning of the names of topics and of the vehicle's frames, such as ``left/``, if a file has several vehicles.
+    """
+
+    def __init__(self, context: foxglove.Context, prefix: str = "") -> None:
+        self._prefix = prefix
+        self._tf = FrameTransformChannel(f"/{prefix}tf", context=context)
+        self._arm = FrameTransformsChannel(f"/{prefix}tf_arm", context=context)
+        self._pose = PoseInFrameChannel(f"/{prefix}pose", context=context)
+        self._reference = PoseInFrameChannel(f"/{prefix}reference", context=context)
+        self._scene = SceneUpdateChannel(f"/{prefix}scene", context=context)
+        self._path = SceneUpdateChannel(f"/{prefix}scene_path", context=context)
+        self._static = SceneUpdateChannel(f"/{prefix}scene_static", context=context)
         self._geometry: Geometry | None = None
-        self._joints = _Joints(NO_ARM)
+        self._bar_m: float | None = None
+        self._joints = _Joints(NO_ARM, prefix)
         self._planned: tuple[Vec3, ...] = ()
         self._static_due = False
         self._due_s = self._scene_due_s = self._path_due_s = -math.inf
@@ -97,7 +106,8 @@ class ViewerChannels:
             self._geometry = logged_geometry(config["vehicle"])
         except (KeyError, TypeError, ValueError, AttributeError):
             self._geometry = None
-        self._joints = _Joints(self._geometry.arm if self._geometry is not None else NO_ARM)
+        self._bar_m = logged_bar_length_m(config)
+        self._joints = _Joints(self._geometry.arm if self._geometry is not None else NO_ARM, self._prefix)
         self._static_due = True
 
     def plan(self, path: Any) -> None:
@@ -123,7 +133,7 @@ class ViewerChannels:
         stamp = timestamp(stamp_ns)
         if self._static_due:
             self._static_due = False
-            entities = static_entities(self._geometry, self._planned, stamp)
+            entities = static_entities(self._geometry, self._planned, stamp, self._prefix)
             self._static.log(SceneUpdate(entities=entities), log_time=stamp_ns)
         pose = _vehicle_pose(inputs)
         if frames_due:
@@ -135,6 +145,8 @@ class ViewerChannels:
                 self._tether(stamp, stamp_ns, pose, outputs.tether)
             if outputs.ball is not None:
                 self._ball(stamp, stamp_ns, outputs.ball)
+            if inputs.bar is not None and inputs.bar.tracking_valid and t_s - inputs.bar.stamp_s <= _FRESH_S:
+                self._bar(stamp, stamp_ns, inputs.bar)
             self._paths(t_s, stamp, stamp_ns, pose, outputs.reference)
 
     def _frames(
@@ -146,7 +158,7 @@ class ViewerChannels:
             message = FrameTransform(
                 timestamp=stamp,
                 parent_frame_id="world",
-                child_frame_id="body",
+                child_frame_id=f"{self._prefix}body",
                 translation=Vector3(x=x, y=y, z=z),
                 rotation=Quaternion(w=w, x=i, y=j, z=k),
             )
@@ -184,6 +196,17 @@ class ViewerChannels:
         entity = SceneEntity(timestamp=stamp, frame_id="world", id="ball", lifetime=_LIFETIME, spheres=balls)
         self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
 
+    def _bar(self, stamp: Timestamp, stamp_ns: int, bar: BarPose) -> None:
+        if self._bar_m is None or not _usable(bar.position_world_m, bar.attitude_wxyz):
+            return
+        (x, y, z), (dx, dy, dz) = bar.position_world_m, quat_rotate(bar.attitude_wxyz, (0.5 * self._bar_m, 0.0, 0.0))
+        ends = (x + dx, y + dy, z + dz), (x - dx, y - dy, z - dz)
+        line, handles = trail([point3(end) for end in ends], BAR, 8.0), [sphere(end, HANDLE_M, BAR) for end in ends]
+        entity = SceneEntity(
+            timestamp=stamp, frame_id="world", id="bar", lifetime=_LIFETIME, lines=[line], spheres=handles
+        )
+        self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
+
     def _paths(
         self, t_s: float, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat] | None, reference: Reference | None
     ) -> None:
@@ -209,16 +232,16 @@ class ViewerChannels:
 class _Joints:
     """Writes the arm's frames; their constant parts are built once."""
 
-    def __init__(self, arm: ArmSkeleton) -> None:
+    def __init__(self, arm: ArmSkeleton, prefix: str) -> None:
         self._links: list[tuple[str, str, Vector3]] = []
         """Parent, child and position in the parent of each link's frame."""
         x, y, z = arm.shoulder_body_m
-        parent, offset = "body", Vector3(x=x, y=y, z=z)
+        parent, offset = f"{prefix}body", Vector3(x=x, y=y, z=z)
         for number, (x, y, z) in enumerate(arm.links_body_m, start=1):
-            self._links.append((parent, f"link{number}", offset))
-            parent, offset = f"link{number}", Vector3(x=x, y=y, z=z)
+            self._links.append((parent, f"{prefix}link{number}", offset))
+            parent, offset = f"{prefix}link{number}", Vector3(x=x, y=y, z=z)
         self._axes = arm.joint_axes
-        self._net = (parent, "net", offset)
+        self._net = (parent, f"{prefix}net", offset)
 
     def log(self, channel: FrameTransformsChannel, stamp: Timestamp, stamp_ns: int, angle_rad: Sequence[float]) -> None:
         """Write all frames in one message."""

@@ -40,6 +40,8 @@ TAUT = Color(r=0.85, g=0.15, b=0.15, a=1.0)
 BALL = Color(r=0.76, g=0.15, b=0.36, a=1.0)
 MEETING = Color(r=0.76, g=0.15, b=0.36, a=0.25)
 BALL_M = 0.035
+BAR = Color(r=0.75, g=0.78, b=0.82, a=1.0)
+HANDLE_M = 0.02
 
 _DOWN = Quaternion(w=0.0, x=1.0, y=0.0, z=0.0)
 _UPRIGHT = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
@@ -54,12 +56,17 @@ def path_of(data: Any) -> tuple[Vec3, ...]:
 
 
 def static_entities(
-    geometry: Geometry | None, path_world_m: tuple[Vec3, ...], timestamp: Timestamp
+    geometry: Geometry | None, path_world_m: tuple[Vec3, ...], timestamp: Timestamp, prefix: str = ""
 ) -> list[SceneEntity]:
-    """Return the entities of constant shape, each locked to the frame that it moves with."""
+    """Return the entities of constant shape, each locked to the frame that it moves with.
+
+    Args:
+        prefix: beginning of the names of the vehicle's frames.
+    """
     entities: list[SceneEntity] = []
 
     def add(name: str, frame: str, **shapes: Any) -> None:
+        frame = frame if frame == "world" else prefix + frame
         entities.append(SceneEntity(timestamp=timestamp, frame_id=frame, id=name, frame_locked=True, **shapes))
 
     if len(path_world_m) > 1:

@@ -234,7 +234,7 @@ def test_ladder_matches() -> None:
 
 def test_channels_match() -> None:
     source = "".join(text_of(path) for path in sorted((ROOT / "companion/recorder").glob("*.py")))
-    made = set(re.findall(r'(?:Channel|_json_channel)\("(/\w+)"', source))
+    made = {f"/{name}" for name in re.findall(r'(?:Channel|_json_channel)\(f?"/(?:{prefix})?(\w+)"', source)}
     assert {codes(row[0])[0] for row in table(LOG, "channel")} == made
     metadata = set(re.findall(r'metadata\("(\w+)"', source + text_of(ROOT / "companion/flight/main.py")))
     assert {codes(row[0])[0] for row in table(LOG, "metadata")} == metadata

@@ -13,6 +13,7 @@ from companion.ground.telemetry.scene import PATH_POINTS_MAX, scene_of
 from companion.mission.plan import Plan
 from companion.model.codec import to_json
 from companion.model.types import Vec3
+from companion.sitl_config.team import load_team
 from tests.machines import overrides_with_joints
 from tests.support import CATCH, HOVER, tether_of
 from tools.docs.telemetry import FOLDER, schema_file, schema_of, schema_text
@@ -49,6 +50,25 @@ def test_the_scene_has_as_many_links_and_limits_as_the_arm(count: int) -> None:
     assert [len(values) for values in (scene.links_body_m, scene.joint_min_rad, scene.joint_max_rad)] == [count] * 3
     assert decode(Scene, to_json(scene)) == scene
     jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(to_json(scene)))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "partners"),
+    [
+        ((), ("carry-right", "carry-left")),
+        (("left.vehicle.ground.topic=alpha", "right.vehicle.ground.topic=right"), (None, None)),
+    ],
+)
+def test_the_scene_of_a_member_of_a_team_names_the_other_one_and_the_length_of_the_bar(
+    overrides: tuple[str, ...], partners: tuple[str | None, str | None]
+) -> None:
+    scenes = [scene_of(config.flight, "s") for _, config in load_team("carry", overrides).members]
+    assert tuple(scene.partner for scene in scenes) == partners
+    assert [scene.bar_length_m for scene in scenes] == [1.2, 1.2]
+    for scene in scenes:
+        jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(encode(scene)))
+    alone = scene_of(load_flight(CATCH, overrides=["vehicle.ground.topic=carry-left"]), "s")
+    assert (alone.partner, alone.bar_length_m) == (None, None)
 
 
 def test_phases_are_named_as_the_flight_names_them() -> None:

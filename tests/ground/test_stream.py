@@ -16,6 +16,7 @@ from companion.ground.protocol.messages import (
     EVENTS_KEPT,
     MESSAGE_MAX_BYTES,
     BallView,
+    BarView,
     Events,
     HealthLevel,
     Stream,
@@ -27,6 +28,7 @@ from companion.model.codec import Record, to_json
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.markers import BallState
 from companion.model.outputs import ActiveRule, Outputs, Sent
+from companion.model.team import BarPose
 from companion.model.types import (
     AttitudeSetpoint,
     Event,
@@ -105,6 +107,24 @@ def test_a_ball_is_shown_with_the_time_until_the_net_meets_it() -> None:
     assert decode(Stream, to_json(stream)) == stream
     late = stream_of(changed(IN_FLIGHT, outputs__ball=msgspec.structs.replace(ball, meeting_s=t_s - 0.1))).ball
     assert late is not None and late.meets_in_s == 0.0
+
+
+def test_a_bar_is_shown_while_motion_capture_sees_it() -> None:
+    level = (1.0, 0.0, 0.0, 0.0)
+    bar = BarPose(
+        stamp_s=IN_FLIGHT[0].t_s - 0.05, position_world_m=(1.0, 2.0, 0.6), attitude_wxyz=level, tracking_valid=True
+    )
+    stream = stream_of(changed(IN_FLIGHT, bar=bar))
+    assert stream.bar == BarView(position_world_m=(1.0, 2.0, 0.6), attitude_wxyz=level)
+    assert decode(Stream, encode(stream)) == stream
+    jsonschema.Draft202012Validator(schema_of(Topic.STREAM)).validate(json.loads(encode(stream)))
+    changes: tuple[dict[str, Any], ...] = (
+        {"tracking_valid": False},
+        {"stamp_s": bar.stamp_s - 0.1},
+        {"position_world_m": (1.0, math.nan, 0.6)},
+    )
+    for change in changes:
+        assert stream_of(changed(IN_FLIGHT, bar=msgspec.structs.replace(bar, **change))).bar is None
 
 
 def test_the_position_error_is_that_of_the_metrics_also_of_an_old_frame_in_motion() -> None:

@@ -18,6 +18,7 @@ from tests.recorder.viewers import Viewed, at_path, split_path
 pytestmark = pytest.mark.xdist_group("recorded flight")
 
 FOXGLOVE = Path("configs/foxglove/companion.json")
+TEAM = Path("configs/foxglove/team.json")
 PLOTJUGGLER = Path("configs/plotjuggler/companion.xml")
 PANELS: dict[str, Any] = {
     "3D": foxglove.layouts.ThreeDeeConfig,
@@ -100,7 +101,9 @@ def test_a_path_that_a_plot_cannot_show_is_found(viewed: Viewed, path: str) -> N
         resolve(viewed, "Plot", path)
 
 
-def test_the_foxglove_layout_has_the_form_of_a_saved_one(layout: dict[str, Any]) -> None:
+@pytest.mark.parametrize("path", [FOXGLOVE, TEAM])
+def test_the_foxglove_layout_has_the_form_of_a_saved_one(path: Path) -> None:
+    layout = json.loads(path.read_text())
     assert layout.keys() == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
     shown = list(leaves(layout["layout"]))
     for panel in panels(layout, "Tab"):

@@ -13,19 +13,23 @@ import pytest
 from msgspec.structs import fields, replace
 
 from companion.analysis.log import FlightLog
+from companion.cli.main import main
 from companion.config.loader import load_flight, load_vehicle
 from companion.control.arm_model import manipulator_of
 from companion.model.codec import Record, differences
+from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.hanging_line import hanging_line_m
 from companion.model.markers import BallState
 from companion.model.outputs import TetherState
+from companion.model.team import BarPose
 from companion.model.types import Joints, MocapPose, Quat, Vec3
 from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
 from tests.machines import overrides_with_joints
 from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
-from tests.recorder.viewers import Seen, Viewed, view
+from tests.recorder.test_layouts import TEAM
+from tests.recorder.viewers import Seen, Viewed, at_path, split_path, view
 from tests.support import tether_of
 
 NAN = math.nan
@@ -35,7 +39,7 @@ def written(path: Path, rows: Iterable[Row], *, config: str | None = None, plan:
     """Write rows with the log writer alone."""
     log_file = LogFile(path)
     writer = LogWriter(log_file, EPOCH_NS)
-    writer.metadata("companion", {"log_format": "1"})
+    writer.metadata("companion", {"log_format": "1", "epoch_offset_ns": str(EPOCH_NS)})
     writer.metadata("config", {"json": config_json() if config is None else config})
     if plan is not None:
         writer.metadata("plan", {"json": plan, "mission_s": "1.0"})
@@ -375,6 +379,56 @@ def test_a_tick_that_cannot_be_drawn_is_recorded_and_reported_once(tmp_path: Pat
     assert len(viewed.by_topic["/inputs"]) == len(viewed.by_topic["/sent"]) == len(rows)
     assert [message.data["name"] for message in viewed.by_topic["/log"]] == ["recorder"]
     assert viewed.by_topic["/log"][0].data["message"].startswith("viewer messages left out: tick 0: ValueError")
+
+
+def test_a_bar_is_drawn_between_its_handles_while_it_is_seen(tmp_path: Path) -> None:
+    inputs, outputs, sent = still()[0]
+    half_turn = quat_from_euler_zyx(0.0, 0.0, math.pi / 2.0)
+    bar = BarPose(stamp_s=inputs.t_s, position_world_m=(1.0, 2.0, 0.6), attitude_wxyz=half_turn, tracking_valid=True)
+    config = json.dumps({"mission": {"phases": [{"type": "land"}, {"type": "grip", "bar": {"length_m": 1.2}}]}})
+    for number, (seen, count) in enumerate(
+        ((bar, 1), (replace(bar, stamp_s=inputs.t_s - 0.2), 0), (replace(bar, tracking_valid=False), 0))
+    ):
+        row = replace(inputs, bar=seen), outputs, sent
+        viewed = written(tmp_path / f"{number}.mcap", [row], config=config)
+        assert len(viewed.by_topic["/scene"]) == count
+        if count:
+            ends = [vec(end) for end in only(viewed.by_topic["/scene"], "bar")["lines"][0]["points"]]
+            assert [value for end in ends for value in end] == pytest.approx([1.0, 2.6, 0.6, 1.0, 1.4, 0.6])
+
+
+def test_a_file_shows_the_vehicles_of_several_logs_each_with_frames_and_topics_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The layout for a team finds everything in it."""
+    places: dict[str, Vec3] = {"left": (0.0, 1.0, 1.0), "right": (0.0, -1.0, 1.0)}
+    logs = [tmp_path / name / "flight.mcap" for name in places]
+    for log, place in zip(logs, places.values(), strict=True):
+        log.parent.mkdir()
+        written(log, [moved(row, place, (1.0, 0.0, 0.0, 0.0), (0.1, 0.2)) for row in tethered(end_s=1.0)])
+    out = tmp_path / "new" / "both.mcap"
+    export = ["export", *map(str, logs), "--format", "foxglove"]
+    assert main([*export, "--out", str(out)]) == EXIT_OK
+    viewed, single = view(out), view(logs[0])
+    own = {"body", "link1", "link2", "net"}
+    assert viewed.frames() == {"world"} | {f"{name}/{frame}" for name in places for frame in own}
+    for name, place in places.items():
+        assert vec(viewed.by_topic[f"/{name}/pose"][0].data["pose"]["position"]) == place
+        frames = {one["frame_id"] for one in viewed.by_topic[f"/{name}/scene_static"][0].data["entities"]}
+        assert frames == {"world"} | {f"{name}/{frame}" for frame in own}
+        for topic in ("/tf", "/tf_arm", "/scene", "/reference"):
+            stamps_ns = [message.log_time_ns for message in single.by_topic[topic]]
+            assert [message.log_time_ns for message in viewed.by_topic[f"/{name}{topic}"]] == stamps_ns != [], topic
+    events = [message.data["name"] for message in single.by_topic["/log"]]
+    assert [m.data["name"] for m in viewed.by_topic["/log"]] == [f"{name} {e}" for e in events for name in places]
+    layout = json.loads(TEAM.read_text())["configById"]
+    assert layout["3D!room"]["topics"].keys() <= viewed.schemas.keys()
+    for series in (series for name in layout if name.startswith("Plot") for series in layout[name]["paths"]):
+        topic, steps = split_path(series["value"])
+        assert isinstance(at_path(viewed.by_topic[topic][0].data, steps), float)
+    assert main([*export, "--out", str(out)]) == EXIT_BAD_INPUT
+    assert f"{out}: cannot be written: File exists" in capsys.readouterr().err
+    assert main(export) == EXIT_BAD_INPUT
 
 
 def floats(data: Any) -> Iterable[float]:

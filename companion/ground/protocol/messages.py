@@ -134,6 +134,10 @@ class Scene(Record, frozen=True, kw_only=True):
     phases: tuple[str, ...]
     has_contact: bool | None = None
     """True if the mission has contact phases, else None."""
+    bar_length_m: float | None = None
+    """Distance between the handles of the bar whose one end the vehicle grips; None if the mission has no bar."""
+    partner: str | None = None
+    """Name in topics of the vehicle that grips the other end; None if there is none."""
 
 
 class PreflightRow(Record, frozen=True):
@@ -241,6 +245,15 @@ class BallView(Record, frozen=True, kw_only=True):
     """Time until the net is to meet it."""
 
 
+class BarView(Record, frozen=True, kw_only=True):
+    """The bar that two vehicles carry; see `companion.model.team.BarPose`."""
+
+    position_world_m: Vec3
+    """Middle between the handles."""
+    attitude_wxyz: Quat
+    """Attitude; x points to the left end."""
+
+
 class Timing(Record, frozen=True, kw_only=True):
     """Durations of the loop and the links: the largest of all ticks since the previous message."""
 
@@ -301,6 +314,8 @@ class Stream(Record, frozen=True, kw_only=True):
     contact: ContactView | None = None
     """None outside contact phases."""
     ball: BallView | None = None
+    bar: BarView | None = None
+    """None while motion capture does not see it."""
     timing: Timing
     lights: tuple[DeviceHealth, ...]
     limited_by: tuple[str, ...]

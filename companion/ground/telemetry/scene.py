@@ -11,6 +11,8 @@ from companion.ground.protocol.messages import VERSION, Scene
 from companion.mission.phase import phases_of
 from companion.model.arm_skeleton import skeleton_of
 from companion.model.types import Vec3
+from companion.phases.carry.bar import End
+from companion.phases.carry.grip import GripHandle
 
 PATH_POINTS_MAX = 300
 
@@ -25,6 +27,7 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
     vehicle, phases = config.vehicle, phases_of(config.mission)
     room, tether, safety, airframe, arm = vehicle.room, vehicle.tether, vehicle.safety, vehicle.airframe, vehicle.arm
     skeleton = skeleton_of(chain_of(vehicle))
+    grip = next((phase for phase in phases if isinstance(phase, GripHandle)), None)
     return Scene(
         v=VERSION,
         session=session,
@@ -51,7 +54,16 @@ def scene_of(config: FlightConfig, session: str, path_world_m: Sequence[Vec3] = 
         path_world_m=thinned(path_world_m),
         phases=tuple(phase.title for phase in phases),
         has_contact=any(phase.touches for phase in phases) or None,
+        bar_length_m=grip.bar.length_m if grip is not None else None,
+        partner=_partner(vehicle.ground.topic, grip.end) if grip is not None else None,
     )
+
+
+def _partner(topic: str | None, end: End) -> str | None:
+    """Return the name of the other vehicle in topics if this one's is TEAM-END, as a team file sets it."""
+    if topic is None or not topic.endswith(f"-{end}"):
+        return None
+    return topic.removesuffix(end) + ("right" if end == "left" else "left")
 
 
 def thinned(path_world_m: Sequence[Vec3]) -> tuple[Vec3, ...]:

@@ -19,6 +19,7 @@ from companion.ground.protocol.messages import (
     EVENTS_KEPT,
     VERSION,
     BallView,
+    BarView,
     ContactView,
     ControlView,
     EventLine,
@@ -35,6 +36,7 @@ from companion.model.contact import ContactState
 from companion.model.flight_stage import Stage
 from companion.model.markers import BallState
 from companion.model.outputs import ControlLog, Outputs, Sent, TetherState
+from companion.model.team import BarPose
 from companion.model.types import Inputs, Quat, Reference, SafetyAction, Vec3
 
 STREAM_PERIOD_S = 0.05
@@ -183,6 +185,7 @@ class StreamBuilder:
             control=_control(o.control, self._has_force),
             contact=_contact(o.contact),
             ball=_ball(o.ball, i.t_s),
+            bar=_bar(i.bar, i.t_s),
             timing=timing,
             lights=self._health.evaluate(snapshot),
             limited_by=o.limited_by,
@@ -340,6 +343,13 @@ def _ball(ball: BallState | None, t_s: float) -> BallView | None:
     meeting = None if ball.meeting_world_m is None else _rounded(ball.meeting_world_m, 3)
     meets_in_s = None if ball.meeting_s is None else _number(max(0.0, ball.meeting_s - t_s), 3)
     return BallView(position_world_m=position, meeting_world_m=meeting, meets_in_s=meets_in_s)
+
+
+def _bar(bar: BarPose | None, t_s: float) -> BarView | None:
+    if bar is None or not bar.tracking_valid or not t_s - bar.stamp_s <= GRADED_POSE_MAX_AGE_S:
+        return None
+    position, attitude = _rounded(bar.position_world_m, 4), _rounded(bar.attitude_wxyz, 5)
+    return None if position is None or attitude is None else BarView(position_world_m=position, attitude_wxyz=attitude)
 
 
 def truncated(text: str) -> str:

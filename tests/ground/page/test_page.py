@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from companion.ground.protocol.messages import HealthLevel, Presence, Stream
+from companion.ground.protocol.messages import BarView, HealthLevel, Presence, Stream
 from tests.ground.monitor_stub import (
     BROKER,
     NAME,
@@ -296,6 +296,57 @@ def test_several_vehicles(stub: MonitorStub, page: Page) -> None:
     assert page.text("#word") == "FLYING" and page.text("#notice").startswith(f"{NAME}: LOST")
     page.press("hold")
     assert stub.wait_received("command", 1) == [{"kind": "command", "vehicle": "second", "command": "hold"}]
+
+
+def test_both_vehicles_of_a_team_are_shown_and_commands_go_to_the_chosen_one(stub: MonitorStub, page: Page) -> None:
+    """Each names the other. As long as only one does, they are shown one at a time."""
+    numbers = itertools.count(1)
+    other: dict[str, Any] = {"action": "hold", "hold": 1, "position_world_m": (1.0, 1.0, 1.5)}
+
+    def scene_of_team(vehicle: str, partner: str) -> Message:
+        return relayed(replace(flown().scene, partner=partner, bar_length_m=1.2), vehicle)
+
+    def picture(**changes: Any) -> str:
+        page.show(*(relayed(in_flight(t_s=1e3 + next(numbers), **changes.get(v, {})), v) for v in (NAME, "second")))
+        page.run(0.1)
+        found: str = page.tab.evaluate("document.getElementById('scene').toDataURL()")
+        return found
+
+    def boxes() -> list[Any]:
+        return [page.tab.locator(f"[data-command='{command}']").bounding_box() for command in ("hold", "land", "start")]
+
+    def team() -> list[list[str]]:
+        read = "(b) => [b.ariaPressed, ...['.name', '.word', '.answer'].map((s) => b.querySelector(s).innerText)]"
+        found: list[list[str]] = page.tab.evaluate(f"[...document.querySelectorAll('#team button')].map({read})")
+        return found
+
+    page.show(relayed(in_flight()), scene_of_team(NAME, "second"), *retained("second"))
+    pictures = [picture(second=other)]
+    assert not page.tab.is_visible("#team")
+    before = boxes()
+    page.show(scene_of_team("second", NAME))
+    pictures.append(picture(second=other))
+    assert team() == [["false", "second", "HOLDING", ""], ["true", NAME, "FLYING", ""]] and boxes() == before
+    assert page.tab.locator("#team [data-vehicle='second'] i").count() == len(in_flight().lights)
+    other["attitude_wxyz"] = (0.6, 0.0, 0.0, 0.8)
+    pictures.append(picture(second=other))
+    other["bar"] = BarView(position_world_m=(0.5, 0.5, 0.8), attitude_wxyz=(1.0, 0.0, 0.0, 0.0))
+    pictures.append(picture(second=other))
+    assert len(set(pictures)) == 4, "the other vehicle, its attitude and its bar are drawn"
+
+    page.press("hold")
+    page.tab.click("#team [data-vehicle='second']")
+    page.shown = "second"
+    aims = page.tab.locator("#team .aim").all_inner_texts()
+    assert aims == ["commands go here", "choose"], "second is the first in the alphabet"
+    assert NAME not in page.text(".command-grid") and page.text("[data-command='hold']").endswith("second")
+    page.press("land")
+    page.tab.keyboard.press("Shift+A")
+    asked = [(message["vehicle"], message["command"]) for message in stub.wait_received("command", 3)]
+    assert asked == [(NAME, "hold"), ("second", "land"), ("second", "abort")]
+    page.show({"kind": "refused", "vehicle": NAME, "command": "hold", "text": "no answer"})
+    page.run(1.0)
+    assert team()[1] == ["false", NAME, "STALE", "hold: no answer"]
 
 
 def test_without_a_connection_nothing_is_sent_and_a_restarted_monitor_is_found_again(

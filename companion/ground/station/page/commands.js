@@ -16,7 +16,7 @@ const HELP = "use Ctrl-C in the flight's terminal, or the pilot's switch";
  * Reason why a command cannot be given now, or null. Commands that make the flight safer do not need fresh data.
  *
  * @param name of the command
- * @param context {canCommand, whyNot, vehicle, verdict}: state of page and vehicle
+ * @param context {canCommand, whyNot, vehicle, verdict, named}: state of page and vehicle; whether the buttons name the vehicle
  */
 export function refusal(name, { canCommand, whyNot, vehicle, verdict }) {
   if (!canCommand) return whyNot || "view only";
@@ -95,6 +95,12 @@ export class Commands {
     this.draw(this._context);
   }
 
+  /** The newest result of a vehicle's commands, with the name of the command. */
+  newest(vehicle) {
+    const results = BUTTONS.map(({ dataset: { command: name } }) => ({ name, ...this._results.get(`${vehicle} ${name}`) }));
+    return results.filter((result) => result.text).sort((a, b) => b.atMs - a.atMs)[0];
+  }
+
   _sent(key, nonce) {
     const result = this._results.get(key);
     if (!result) return;
@@ -125,7 +131,8 @@ export class Commands {
     for (const [name, { button, hint, output }] of this._buttons) {
       const why = refusal(name, context);
       if (button.disabled !== (why !== null)) button.disabled = why !== null;
-      setText(hint, button.dataset.press !== "long" || general !== null ? "" : why ?? "press and hold");
+      const how = button.dataset.press === "long" ? why ?? "press and hold" : "";
+      setText(hint, general !== null ? "" : [context.named ? context.vehicle.name : "", how].filter(Boolean).join(": "));
       const result = context.vehicle === null ? undefined : this._results.get(`${context.vehicle.name} ${name}`);
       if (result?.state === "wait" && now - result.atMs > NO_ANSWER_MS) Object.assign(result, { state: "no", text: `no answer from the monitor: ${HELP}` });
       setText(output, result?.text ?? "");

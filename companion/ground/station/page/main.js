@@ -11,6 +11,7 @@ import { ControlDetails, DeviceList, Figures, PreflightList } from "./panels.js"
 import { Plots } from "./plots.js";
 import { Replay } from "./replay.js";
 import { SceneView } from "./scene.js";
+import { Team } from "./team.js";
 import { TopBar } from "./topbar.js";
 import { Vehicle } from "./vehicle.js";
 
@@ -39,10 +40,8 @@ const link = new Link(takeToken(), onMessage, () => {
   if (!link.open) broker = null;
   update();
 });
-const topBar = new TopBar((name) => {
-  chosen = name;
-  refresh();
-});
+const topBar = new TopBar(choose);
+const team = new Team(choose);
 const figures = new Figures(byId("figures"));
 const sceneView = new SceneView(byId("scene"), document.querySelector(".presets"), () => refresh());
 const plots = new Plots(byId("plots"), () => refresh());
@@ -59,7 +58,8 @@ function onMessage(message) {
   else if (kind === "sent" || kind === "refused" || kind === "ack") commands.onMessage(message);
   else if (typeof message.vehicle === "string" && message.data) vehicleOf(message.vehicle).take(kind, message.data, nowMs(), message.age_s);
   if (kind === "stream") {
-    if (message.vehicle === current()?.name) {
+    const shown = current();
+    if (message.vehicle === shown?.name || message.vehicle === partnerOf(shown)?.name) {
       redraw.scene = redraw.plots = true;
       requestPaint();
     }
@@ -92,6 +92,17 @@ function current() {
   return here ?? all[0] ?? null;
 }
 
+function choose(name) {
+  chosen = name;
+  refresh();
+}
+
+/** The other vehicle of a vehicle's team, which each of the two names; else null. */
+function partnerOf(vehicle) {
+  const partner = vehicles.get(vehicle?.scene?.partner);
+  return partner && partner !== vehicle && partner.scene?.partner === vehicle.name ? partner : null;
+}
+
 const linkNow = () => ({ open: link.open, everOpen, broker: replay === null ? broker : null });
 
 /** Update everything except the canvases; called at least every 100 ms. */
@@ -105,13 +116,16 @@ function update() {
     devices.clear();
   }
   const others = new Map(replay === null ? [...vehicles].map(([name, one]) => [name, one === vehicle ? verdict : assess(one, state, now)]) : []);
+  const partner = partnerOf(vehicle);
+  const members = partner === null ? [] : [vehicle, partner].sort((a, b) => (a.name < b.name ? -1 : 1));
+  team.draw(members.map((one) => ({ vehicle: one, verdict: others.get(one.name), answer: commands.newest(one.name) })), vehicle?.name, Boolean(hello?.can_command));
   topBar.draw({ vehicle, verdict, hello, others, replayName: replay?.name });
   figures.draw(vehicle);
   devices.draw(vehicle);
   preflight.draw(vehicle);
   details.draw(vehicle);
   eventList.draw(vehicle);
-  commands.draw({ canCommand: Boolean(hello?.can_command), whyNot: hello === null ? "not connected yet" : hello.why_not, vehicle, verdict });
+  commands.draw({ canCommand: Boolean(hello?.can_command), whyNot: hello === null ? "not connected yet" : hello.why_not, vehicle, verdict, named: others.size > 1 });
   setText(byId("operator"), hello?.operator && hello.can_command ? `as ${hello.operator}` : "");
   const problem = link.open && broker?.connected !== false ? otherVehicleProblems(vehicle, others) : null;
   setData(byId("notice"), "level", problem === null ? "" : "bad");
@@ -151,7 +165,9 @@ function paint() {
   if (redraw.scene && now >= sceneDueMs) {
     redraw.scene = false;
     sceneDueMs = now + SCENE_MS;
-    sceneView.draw(vehicle);
+    const partner = partnerOf(vehicle);
+    const { banner, ended, word } = assess(partner, linkNow(), now);
+    sceneView.draw(vehicle, partner, banner?.word ?? (ended ? word : ""));
   }
   if (redraw.plots && now >= plotsDueMs) {
     redraw.plots = false;

@@ -4,7 +4,7 @@ import { Camera, steer } from "./camera.js";
 import { colours, levelColour } from "./colours.js";
 import { fitCanvas } from "./dom.js";
 import { fixed, quantity } from "./format.js";
-import { add, circle, hanging, LEVEL, mix, rotate } from "./geometry.js";
+import { add, circle, hanging, LEVEL, mix, rotate, sub } from "./geometry.js";
 import { lampLevel } from "./verdict.js";
 import { drawBall, drawForce, drawGhost, drawMachine, drawShadow } from "./machine.js";
 import { Renderer } from "./renderer.js";
@@ -32,7 +32,8 @@ export class SceneView {
     for (const button of this._presets) button.setAttribute("aria-pressed", String(button.dataset.preset === this.camera.preset));
   }
 
-  draw(vehicle) {
+  /** @param partner the other vehicle of a team, or null; @param gone why its data is not live, such as STALE, else empty */
+  draw(vehicle, partner = null, gone = "") {
     const fitted = fitCanvas(this.canvas);
     if (fitted === null) return;
     const { context, width, height } = fitted;
@@ -53,10 +54,28 @@ export class SceneView {
     drawRoom(renderer, room);
     if (scene.anchor_world_m) drawReach(renderer, scene, stream, position);
     if (scene.path_world_m.length > 1) renderer.line(scene.path_world_m, colours.plan, { width: 2, dash: [7, 6] });
-    drawTrail(renderer, vehicle.flown());
-    if (scene.anchor_world_m) drawAnchor(renderer, scene);
-    if (position === null || stream === null) return;
-    drawShadow(renderer, scene, position, room.min[2]);
+    const parts = [];
+    for (const one of partner === null ? [vehicle] : [partner, vehicle]) {
+      drawTrail(renderer, one.flown());
+      if (one.scene.anchor_world_m) drawAnchor(renderer, one.scene);
+      const at = one.stream?.position_world_m;
+      if (at) parts.push([renderer.depth(at), () => this._drawVehicle(renderer, one, { chosen: one === vehicle, grey: one === partner && gone !== "" })]);
+    }
+    const bar = stream?.bar ?? (gone ? null : partner?.stream?.bar);
+    if (bar && scene.bar_length_m) parts.push([renderer.depth(bar.position_world_m), () => drawBar(renderer, bar, scene.bar_length_m)]);
+    parts.sort((a, b) => b[0] - a[0]).forEach(([, draw]) => draw());
+    if (partner === null) return;
+    for (const one of [partner, vehicle]) drawName(renderer, one, one === vehicle, one === partner ? gone : "");
+  }
+
+  /** Draw a vehicle that has a position, and the figures beside the chosen one. */
+  _drawVehicle(renderer, vehicle, { chosen, grey }) {
+    const { scene, stream } = vehicle;
+    const position = stream.position_world_m;
+    const attitude = stream.attitude_wxyz ?? LEVEL;
+    const floor = scene.room_min_world_m[2];
+    renderer.context.filter = grey ? "grayscale(1) opacity(0.45)" : "none";
+    drawShadow(renderer, scene, position, floor);
     if (stream.reference_world_m) drawGhost(renderer, scene, stream.reference_world_m, stream.reference_yaw_rad, stream.reference_arm_rad);
     if (stream.ball) drawBall(renderer, scene, stream.ball);
     const tied = Boolean(scene.anchor_world_m);
@@ -67,7 +86,9 @@ export class SceneView {
     if (tied && !behind) drawTether(renderer, scene, stream, position, attitude);
     const force = stream.control?.force_ext_world_n;
     if (force && stream.arm_rad) drawForce(renderer, scene, position, attitude, stream.arm_rad, force);
-    if (this.camera.pitch < 1.2) renderer.text([position[0], position[1], room.min[2]], `${fixed(position[2], 2)} m`, { dx: 26, dy: 8, align: "left", colour: colours.soft });
+    renderer.context.filter = "none";
+    if (!chosen) return;
+    if (this.camera.pitch < 1.2) renderer.text([position[0], position[1], floor], `${fixed(position[2], 2)} m`, { dx: 26, dy: 8, align: "left", colour: colours.soft });
     drawSlack(renderer, scene, stream, position, attitude);
   }
 }
@@ -125,6 +146,23 @@ function drawAnchor(renderer, scene) {
   renderer.area([[x - s, y - s, z], [x + s, y - s, z], [x + s, y + s, z], [x - s, y + s, z]], colours.soft);
   renderer.ball(scene.anchor_world_m, 0.035, colours.ink, { least: 3 });
   renderer.text(scene.anchor_world_m, "anchor", { dy: 15, size: 12 });
+}
+
+/** Draw the bar between its handles, 24 mm thick. */
+function drawBar(renderer, { position_world_m: centre, attitude_wxyz: attitude }, length) {
+  const half = rotate(attitude, [length / 2, 0, 0]);
+  const ends = [add(centre, half), sub(centre, half)];
+  renderer.line(ends, colours.ink, { width: Math.max(4, 0.024 * (renderer.camera.project(centre)?.[2] ?? 0)) });
+  for (const end of ends) renderer.ball(end, 0.025, colours.link, { least: 4, edge: colours.card });
+}
+
+/** Name a vehicle of a team above it; the frame of the chosen one has the colour of its heading. */
+function drawName(renderer, { name, stream }, chosen, gone) {
+  const at = stream?.position_world_m;
+  if (!at) return;
+  const text = chosen ? `▸ ${name}` : [name, gone].filter(Boolean).join(": ");
+  const edge = gone ? colours.bad : chosen ? colours.accent : colours.line;
+  renderer.text(at, text, { colour: chosen ? colours.ink : colours.soft, edge, size: 13, dy: -46 });
 }
 
 const attachment = (scene, position, attitude) => add(position, rotate(attitude, scene.attachment_body_m));
