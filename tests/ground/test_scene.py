@@ -66,7 +66,7 @@ def test_the_scene_of_a_member_of_a_team_names_the_other_one_and_the_length_of_t
     assert tuple(scene.partner for scene in scenes) == partners
     assert [scene.bar_length_m for scene in scenes] == [1.2, 1.2]
     for scene in scenes:
-        jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(encode(scene)))
+        jsonschema.Draft202012Validator(schema_of(Topic.SCENE)).validate(json.loads(to_json(scene)))
     alone = scene_of(load_flight(CATCH, overrides=["vehicle.ground.topic=carry-left"]), "s")
     assert (alone.partner, alone.bar_length_m) == (None, None)
 
