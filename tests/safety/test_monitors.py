@@ -315,6 +315,7 @@ SWING_M = VEHICLE.safety.oscillation_m
         (lambda t_s: 0.45 * SWING_M * math.sin(3.0 * t_s), 0.4, False),
         (lambda t_s: 0.55 * SWING_M * math.sin(3.0 * t_s), 0.2, False),  # the reference wanders, not the vehicle
         (lambda t_s: 3.0 * SWING_M * math.exp(-2.0 * t_s) * math.sin(3.0 * t_s), 0.4, False),  # a blow that dies out
+        (lambda t_s: 2.0 * SWING_M * math.exp(-0.6 * t_s) * math.sin(6.0 * t_s), 0.4, False),  # a chase, four turns
         (lambda t_s: 0.55 * SWING_M * math.sin(0.9 * t_s), 0.4, False),  # drifting air
     ],
 )
