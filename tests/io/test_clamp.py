@@ -149,9 +149,10 @@ async def test_the_joints_go_on_while_the_clamp_is_silent_and_its_state_grows_ol
         await arm.read(1.0)
         old, state = arm.clamp(), await arm.read(1.0)
         assert old is not None and state is not None
-        while state.stamp_s < old.stamp_s + 0.05:
+        # A busy computer may miss some answers of the joints, too.
+        while state.stamp_s < old.stamp_s + 0.05 or state.read_failures:
             state = await arm.read(1.0)
-            assert state is not None and state.read_failures == 0
+            assert state is not None
         assert arm.clamp() == old
 
 
