@@ -57,6 +57,8 @@ _POSE_AGE_MAX_S: Final = 0.1
 """Age of the last trusted pose beyond which the target impedance is not optimised."""
 # Looking up members of an enum costs time in every tick.
 _MISSION: Final = Stage.MISSION
+_CHASE_M_S2: Final = 1.0
+"""Acceleration of the reference of a chase from which the vehicle swings because of it."""
 _REFUSED_AGAIN_S: Final = 1.0
 """Time without a rejection of the same kind after which it is reported again."""
 _SPOOL: Final = Stage.SPOOL
@@ -195,6 +197,7 @@ class FlightCore:
             context.found_armed = None
         context.tracking_error_m = self._control.tracking_error_m if stage is _MISSION else None
         context.control, context.disturbance_world_n = self._log, self._control.disturbance_world_n
+        context.chases = self._state.expected.chase is not None and _accelerates(self._reference)
         context.contact_n, context.grip = self._state.expected.contact_n, self._state.grip
         context.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs, self._vehicle))
         armed_by_others = stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status)
@@ -352,6 +355,10 @@ class FlightCore:
         elif self._control.payload_left(t_s):
             self._context.caught = False
             events.append(event_of(notices.PAYLOAD_LEFT, t_s, "the payload has left the net"))
+
+
+def _accelerates(reference: Reference | None) -> bool:
+    return reference is not None and math.hypot(*reference.acceleration_world_m_s2) > _CHASE_M_S2
 
 
 def force_on_tool_n(log: ControlLog) -> Vec3:

@@ -78,6 +78,8 @@ class FlightTracker:
         self._count_saturation(control, dt_s)
         if control is None or vehicle is None or self.tracking_error_m is None:
             self.oscillation.rate_rad_s = None
+        elif context.chases:
+            self.oscillation = Oscillation(self.oscillation_m)
         else:
             e, w = control.error, vehicle.angular_rate_body_rad_s
             self.oscillation.update(i.t_s, dt_s, (e[0], e[1]), (w[0], w[1]))

@@ -41,6 +41,8 @@ class FlightContext:
     """Why the gate sent none of the law's joint torques in the last tick; None if they were sent."""
     grip: Grip = Grip.FREE
     """What the vehicle has in its clamp."""
+    chases: bool = False
+    """The reference chases a ball: its accelerations swing the vehicle to and fro."""
     waiting: bool = False
     """Inputs are still missing on the ground: only rules with `while_waiting` are evaluated."""
 

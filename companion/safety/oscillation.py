@@ -10,8 +10,8 @@ import math
 from collections import deque
 from typing import Final
 
-TURNS: Final = 5
-"""Number of turning points within `WINDOW_S`, with two whole periods between them. A chase and the blow of its ball make up to four."""
+TURNS: Final = 4
+"""Number of turning points within `WINDOW_S`: two whole periods."""
 WINDOW_S: Final = 6.0
 """Three periods of the slowest limit cycle in docs/internals/safety.md, 2 s."""
 RATE_RAD_S: Final = 0.3

@@ -12,11 +12,12 @@ from companion.config.loader import load_flight
 from companion.control.types import Tuning
 from companion.core.flight_core import FlightCore
 from companion.mission.air import Expectation
-from companion.model.outputs import TetherState
+from companion.model.outputs import ChaseState, TetherState
 from companion.model.team import Grip
 from companion.model.types import OperatorCommand, PhaseKind, SafetyAction, Vec3
 from companion.safety.rules import PARTNER_HOLDS
 from companion.safety.supervisor import SupervisorState
+from tests.control.states import at_rest
 from tests.core.test_reactions import PLAN, in_plan
 from tests.safety.healthy import SLOW, flying, healthy
 
@@ -30,6 +31,7 @@ HOVERING = CONFIG.model_copy(
 )
 NOW_S = healthy().t_s
 INTO: Vec3 = (0.6, 0.8, 0.0)
+CHASE = ChaseState(predicted_s=0.5, replans=1, relative_speed_m_s=4.0)
 
 
 def core_in_flight(observes: bool = False, **fields: Any) -> Any:
@@ -74,6 +76,18 @@ def test_rules_that_forbid_to_resume_are_looked_up_for_a_resume_and_in_a_hold_wi
     _, observation = core._observe(replace(healthy(), command=command), 0.005)
     assert looked_up == asked
     assert observation.standing == ("a rule" if asked else None)
+
+
+@pytest.mark.parametrize(
+    ("chase", "acceleration_m_s2", "chases"), [(CHASE, 1.1, True), (CHASE, 0.9, False), (None, 1.1, False)]
+)
+def test_a_chase_is_one_while_its_reference_accelerates(
+    chase: ChaseState | None, acceleration_m_s2: float, chases: bool
+) -> None:
+    core = core_in_flight(expected=Expectation(chase=chase))
+    core._reference = replace(at_rest((0.0, 0.0, 1.0), 0.0, ()), acceleration_world_m_s2=(0.0, acceleration_m_s2, 0.0))
+    core._observe(healthy(), 0.005)
+    assert core._context.chases is chases
 
 
 @pytest.mark.parametrize(

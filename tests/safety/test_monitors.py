@@ -15,6 +15,7 @@ from companion.safety.oscillation import Oscillation
 from companion.safety.validity import InputFilter
 from tests.safety.faults import (
     EXTERNAL,
+    FAULTS,
     NAN,
     NO_INERTIAL,
     REPEATS,
@@ -25,6 +26,7 @@ from tests.safety.faults import (
     moved,
     replace,
     slow_link,
+    swinging,
 )
 from tests.safety.healthy import START_S, TICK_S, after_a_moment, flying, healthy, put, standing, stopped, watched
 
@@ -315,7 +317,6 @@ SWING_M = VEHICLE.safety.oscillation_m
         (lambda t_s: 0.45 * SWING_M * math.sin(3.0 * t_s), 0.4, False),
         (lambda t_s: 0.55 * SWING_M * math.sin(3.0 * t_s), 0.2, False),  # the reference wanders, not the vehicle
         (lambda t_s: 3.0 * SWING_M * math.exp(-2.0 * t_s) * math.sin(3.0 * t_s), 0.4, False),  # a blow that dies out
-        (lambda t_s: 2.0 * SWING_M * math.exp(-0.6 * t_s) * math.sin(6.0 * t_s), 0.4, False),  # a chase, four turns
         (lambda t_s: 0.55 * SWING_M * math.sin(0.9 * t_s), 0.4, False),  # drifting air
     ],
 )
@@ -332,6 +333,14 @@ def test_only_swings_that_last_are_an_oscillation(
         found.append(watch.rate_rad_s is not None)
     assert any(found) is oscillates
     assert not any(found[:400]), "not before two periods, of 2.1 s each"
+
+
+@pytest.mark.parametrize("chases", [True, False])
+def test_swings_that_a_chase_causes_are_not_counted(chases: bool) -> None:
+    context = swinging()
+    context.chases = chases
+    events = watched(VEHICLE, after_a_moment(FAULTS["oscillates"].change), context)
+    assert [event.id for event in events] == ([] if chases else ["oscillates"])
 
 
 @pytest.mark.parametrize(("late_s", "id_"), [(0.01, None), (0.03, "link_slow"), (0.06, "link_late")])

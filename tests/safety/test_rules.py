@@ -87,7 +87,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "recorder_drops": (WARN, WARN, 0.015),
     "guardian_lost": (LAND, WARN, 0.015),  # in the air it is no reason to land; a flight does not begin without it
     "tilt": (None, PX4_LANDS, 0.105),  # the law has lost control; on the ground a vehicle may stand on a slope
-    "oscillates": (None, PX4_LANDS, 1.235),  # the law is unstable: its hold and its landing would swing too
+    "oscillates": (None, PX4_LANDS, 0.985),  # the law is unstable: its hold and its landing would swing too
     "crashed": (None, TERMINATE, 0.300),  # the rotors must stop
     "too_fast": (None, HOLD, 0.105),  # stopping is enough
     "climbs_too_fast": (None, LAND, 0.105),
@@ -131,7 +131,7 @@ READS = """
     joint_jump 2 29; servo_warm 68 65; servo_hot 76 75; servo_overload -2.5 0.1; joint_rate 0 745 700;
     joint_beyond_limit 180 57 5; joint_far_beyond_limit 115 -25 15; force_lost 0.25; force_overload 1 -1 0;
     force_drift 3.3 0.0 0.0 2.0; force_disagrees 0.0 0.0 0.8 0.0 0.0 -0.8;
-    oscillates 0.10 19; loop_late 205 50; loop_stalled 1005 300; tilt 45 40; crashed 120;
+    oscillates 0.10 18; loop_late 205 50; loop_stalled 1005 300; tilt 45 40; crashed 120;
     too_fast 2.1 2.0; climbs_too_fast 1.6 1.5; sinks_too_fast 1.6 1.5; geofence_left -1.90 0.00 1.00;
     geofence_near 2.29 0.00 1.00; tracking_warn 0.50 0.45; tracking_hold 0.70 0.60; tracking_error 1.20 0.80;
     thrust_saturated 54 1.0; contact_force_high 15.0 12.0; tether_short 0.05 0.10; tether_taut 1.20 0;
