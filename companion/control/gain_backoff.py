@@ -39,5 +39,9 @@ class GainBackoff:
                 self.share = 1.0
 
     def torque_nm(self, torque_nm: Joints, gravity_nm: Joints) -> Joints:
-        """Return the joint torques, N m, with the present share of what they add to the nominal gravity torques."""
+        """Return the joint torques, N m, with the present share of what they add to the nominal gravity torques; a wrong number of them
+        is left to the gate.
+        """
+        if len(torque_nm) != len(gravity_nm):
+            return torque_nm
         return tuple([g + self.share * (nm - g) for nm, g in zip(torque_nm, gravity_nm, strict=True)])

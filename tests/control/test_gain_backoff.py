@@ -1,5 +1,7 @@
 """The feedback of an arm that swings is lowered until it is still, and comes back slowly."""
 
+import math
+
 import pytest
 
 from companion.control.gain_backoff import AGE_MAX_S, RISE_TIME_S, SHARE_MIN, GainBackoff
@@ -36,3 +38,10 @@ def test_gravity_is_carried_whole_and_only_what_the_law_adds_is_lowered() -> Non
     backoff = GainBackoff()
     backoff.share = 0.25
     assert backoff.torque_nm((1.0, -2.0), (0.2, 0.4)) == pytest.approx((0.4, -0.2))
+
+
+def test_torques_that_the_gate_refuses_pass_unchanged_and_raise_nothing() -> None:
+    backoff = GainBackoff()
+    backoff.share = 0.25
+    assert backoff.torque_nm((1.0, -2.0, 0.5), (0.2, 0.4)) == (1.0, -2.0, 0.5)
+    assert not math.isfinite(sum(backoff.torque_nm((math.nan, 0.0), (0.2, 0.4))))
