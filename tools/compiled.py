@@ -51,6 +51,7 @@ COMPILED = (
     "companion/phases/intercept/meeting.py",
     "companion/phases/intercept/motion.py",
     "companion/phases/intercept/net.py",
+    "companion/phases/intercept/rotors.py",
     "companion/model/*.py",
     "companion/io/dynamixel/scale.py",
     "companion/io/px4/delta_velocity.py",

@@ -7,8 +7,10 @@ import random
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
+from scipy.spatial.transform import Rotation
 
 from companion.config.loader import load_flight
 from companion.control.arm_model import manipulator_of
@@ -18,14 +20,16 @@ from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
 from companion.mission.segments import Segment
 from companion.model.constants import GRAVITY_M_S2, TICK_PERIOD_S
+from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.markers import Marker, MarkerFrame
-from companion.model.types import Inputs, OperatorCommand, Reference, Vec3
+from companion.model.types import Inputs, OperatorCommand, Reference, Vec3, VehicleState
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate
 from companion.phases.intercept.meeting import BODY_S2, RISES_S, TILT_S2_M, Lag, meetings, reach_of
 from companion.phases.intercept.motion import OVERSHOOT, Bounds, State
 from companion.phases.intercept.net import net_m, opening
 from companion.phases.intercept.phase import Intercept, Interception, Mode
+from companion.phases.intercept.rotors import clearance_m, places_body_m
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 from companion.safety.stop import StopModel
@@ -352,7 +356,7 @@ def test_a_ball_at_the_rotors_makes_the_vehicle_stay() -> None:
     assert "ball_at_rotors" in flown.ids and flown.farthest_m == 0.0
 
 
-def test_no_ball_crosses_the_rotor_disks_of_a_vehicle_that_moves_to_meet_it() -> None:
+def test_no_ball_crosses_the_rotors_of_a_vehicle_that_tilts_and_lags_on_its_way_to_it() -> None:
     air, airframe = Tick(0.0, None, True, []), CONFIG.vehicle.airframe
     state, changed = PHASE.begin(air), 0
     for path, _, _ in throws(150, 6):
@@ -361,20 +365,100 @@ def test_no_ball_crosses_the_rotor_disks_of_a_vehicle_that_moves_to_meet_it() ->
         changed += plan != best
         if plan is None:
             continue
-        now, at = state.now, dict[float, State]()
+        now, lag, at = state.now, Lag(), dict[float, tuple[State, Lag]]()
         for tick in range(round(plan.point.t_s * 200)):
             t_s = tick * TICK_PERIOD_S
-            at[round(t_s, 6)] = now
+            at[round(t_s, 6)] = (now, lag)
             pushed = BOUNDS.pushed(t_s, now, TICK_PERIOD_S, plan.push_m_s2(t_s, REACH.drop_m))
             if pushed is None:
                 break
-            now = pushed
+            now, lag = pushed, lag.after(TICK_PERIOD_S, pushed.acceleration_m_s2)
         for point in path:
-            if (there := at.get(round(point.t_s, 6))) is not None:
-                px, py, pz = (b - o for b, o in zip(point.position_m, there.position_m, strict=True))
-                for x, y, z in airframe.rotor_layout.positions_body_m:
-                    assert abs(pz - z) >= 0.04 or math.hypot(px - x, py - y) >= airframe.disk_radius_m
+            if (found := at.get(round(point.t_s, 6))) is not None:
+                place = in_body_m(*found, point.position_m)
+                for rotor in airframe.rotor_layout.positions_body_m:
+                    x, y, z = place - rotor
+                    assert abs(z) >= 0.04 or math.hypot(x, y) >= airframe.disk_radius_m
     assert changed > 0, "the rotors forbid no meeting"
+
+
+def in_body_m(now: State, lag: Lag, at_m: Vec3) -> np.ndarray:
+    """The position of a ball in the frame of the body that follows the reference through its lags, as far as they are modelled."""
+    x, y, z = now.position_m
+    body_m = (x + _weighed(BODY_S2, lag.x_m_s2), y + _weighed(BODY_S2, lag.y_m_s2), z)
+    # Thrust and weight give the acceleration.
+    up = now.acceleration_m_s2[2] + GRAVITY_M_S2
+    lean = [GRAVITY_M_S2 * _weighed(TILT_S2_M, values) / up for values in (lag.x_m_s2, lag.y_m_s2)]
+    axis = np.array([-lean[1], lean[0], 0.0])
+    angle_rad = math.atan(math.hypot(*lean))
+    attitude = Rotation.from_rotvec(axis * angle_rad / max(1e-12, math.hypot(*lean)))
+    return np.asarray(attitude.inv().apply(np.subtract(at_m, body_m)))
+
+
+@pytest.mark.parametrize("push", [(5.0, 3.0, 4.0), (-6.0, 4.0, -5.0)], ids=["rising", "falling"])
+def test_a_ball_is_placed_in_the_frame_of_the_body_that_tilts_and_lags(push: Vec3) -> None:
+    path = [ball.Point(0.01 * k, (0.3, -0.2, 1.2), (0.0, 0.0, 0.0), 0.0) for k in range(31)]
+    rest = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    found = list(places_body_m(None, 0.0, 0.0, rest, Lag(), path, lambda t_s: push))
+    now, lag = rest, Lag()
+    for point, place in zip(path, found, strict=True):
+        if point.t_s > 0.0:
+            v = tuple(point.t_s * a for a in push)
+            p = tuple(o + 0.5 * point.t_s**2 * a for o, a in zip(rest.position_m, push, strict=True))
+            now, lag = State((p[0], p[1], p[2]), (v[0], v[1], v[2]), push), lag.after(0.01, push)
+        assert place == pytest.approx(in_body_m(now, lag, point.position_m), abs=0.015)
+
+
+def measured(beside_m: Vec3, roll_deg: float, pitch_deg: float) -> VehicleState:
+    x, y, z = (a + b for a, b in zip(HOME.position_world_m, beside_m, strict=True))
+    return VehicleState(
+        position_stamp_s=0.0, attitude_stamp_s=0.0, imu_stamp_s=0.0, position_world_m=(x, y, z), velocity_world_m_s=(0.0, 0.0, 0.0),
+        attitude_wxyz=quat_from_euler_zyx(math.radians(roll_deg), math.radians(pitch_deg), HOME.yaw_rad),
+        angular_rate_body_rad_s=(0.0, 0.0, 0.0), specific_force_body_m_s2=(0.0, 0.0, GRAVITY_M_S2),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("state", "expected_m"),
+    [
+        (None, 0.1),
+        (measured((0.0, 0.0, 0.0), 0.0, 0.0), 0.1),
+        (measured((0.0, 0.0, 0.08), 0.0, 0.0), 0.02),
+        (measured((-0.13, 0.0, 0.0), 0.0, 0.0), 0.13 + 0.15 - 0.165),
+        (measured((0.0, 0.0, 0.0), 0.0, -15.0), 0.0),  # nose up: the front rotors rise by 0.1 m where the ball flies
+        (measured((0.0, 0.0, 0.0), 0.0, 15.0), 0.2),
+    ],
+    ids=["unknown", "level", "higher", "behind", "nose-up", "nose-down"],
+)
+def test_the_distance_of_a_ball_is_that_from_the_rotors_as_they_were_measured(
+    state: VehicleState | None, expected_m: float
+) -> None:
+    """A ball falls to 0.1 m above the disk of the front left rotor, 0.15 m before its axis, and stays there."""
+    airframe = CONFIG.vehicle.airframe
+    rotor = max(airframe.rotor_layout.positions_body_m, key=lambda at: at[0] + at[1])
+    x, y, z = quat_rotate(quat_from_euler_zyx(0.0, 0.0, HOME.yaw_rad), (rotor[0] + 0.15, rotor[1], rotor[2] + 0.1))
+    px, py, pz = HOME.position_world_m
+    path = [ball.Point(0.01 * k, (px + x, py + y, pz + z), (0.0, 0.0, 0.0), 0.0) for k in range(3)]
+    rest = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    places = places_body_m(state, HOME.yaw_rad, 0.0, rest, Lag(), path, lambda t_s: (0.0, 0.0, 0.0))
+    assert clearance_m(airframe, places) == pytest.approx(expected_m, abs=0.015)
+
+
+@pytest.mark.parametrize(("of_a_stop_m", "stops"), [(0.03, True), (0.01, False)], ids=["stop-better", "stop-worse"])
+def test_a_chase_in_which_the_ball_comes_to_the_rotors_stops_unless_the_stop_brings_it_nearer(
+    of_a_stop_m: float, stops: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = Intercept._clearance_m
+
+    def clearance_of(phase: Intercept, air: Air, s: Interception, path: list[ball.Point], plan: Any) -> float:
+        if s.mode is Mode.WAIT:
+            return asked(phase, air, s, path, plan)
+        return of_a_stop_m if plan is None else 0.02
+
+    monkeypatch.setattr(Intercept, "_clearance_m", clearance_of)
+    flown = Flown(frames([MEETABLE], 0.6), 0.5)
+    assert ("ball_at_rotors" in flown.ids) == stops
+    assert (flown.states[-1].mode is Mode.STOP) == stops
 
 
 def test_frames_lost_for_50_ms_do_not_end_a_chase() -> None:

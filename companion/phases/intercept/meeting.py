@@ -65,9 +65,16 @@ class Lag(Record, frozen=True):
             drop_m: distance of the net below the body's origin by which it swings.
             ahead_m: horizontal position of the net relative to the body, world frame.
         """
-        x, y = (sum(map(operator.mul, TILT_S2_M, lags)) for lags in (self.x_m_s2, self.y_m_s2))
-        u, v = (sum(map(operator.mul, BODY_S2, lags)) for lags in (self.x_m_s2, self.y_m_s2))
+        (x, y), (u, v) = self.slopes(), self.body_m()
         return (u - drop_m * x, v - drop_m * y, -ahead_m[0] * x - ahead_m[1] * y)
+
+    def body_m(self) -> tuple[float, float]:
+        """Return the horizontal displacement of the body from its reference, world frame."""
+        return sum(map(operator.mul, BODY_S2, self.x_m_s2)), sum(map(operator.mul, BODY_S2, self.y_m_s2))
+
+    def slopes(self) -> tuple[float, float]:
+        """Return the slopes of the body's tilt, world frame."""
+        return sum(map(operator.mul, TILT_S2_M, self.x_m_s2)), sum(map(operator.mul, TILT_S2_M, self.y_m_s2))
 
 
 def _lagging(values: tuple[float, ...], followed: float, dt_s: float) -> tuple[float, ...]:

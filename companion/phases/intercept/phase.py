@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from enum import Enum
+from functools import partial
 from itertools import product
 from typing import Annotated, Any, ClassVar, Final, Literal
 
@@ -17,7 +18,6 @@ from companion.control.arm_model import manipulator_of
 from companion.mission.air import Air, Expectation
 from companion.mission.phase import Checking, Phase, Planning
 from companion.model.codec import Record
-from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.markers import BallState
 from companion.model.outputs import ChaseState
 from companion.model.types import Reference, SafetyAction, Severity, Vec3
@@ -26,6 +26,7 @@ from companion.phases.intercept.ball import Candidate, Point
 from companion.phases.intercept.meeting import FROZEN_S, Lag, Plan, Reach, meetings, reach_of
 from companion.phases.intercept.motion import Bounds, Motion, State, motion_to
 from companion.phases.intercept.net import beside_m, net_m, opening
+from companion.phases.intercept.rotors import clearance_m, places_body_m
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 
@@ -46,8 +47,7 @@ FLOOR_M: Final = 0.1
 TRACKING_M: Final = 0.1
 """Distance from the limits of room and tether in the box."""
 BALL_M: Final = 0.05
-BALL_CHASED_M: Final = 0.045
-"""Distance from the rotor disks at which a ball passes them, before and during a chase; it may be this large."""
+"""Distance of its centre from the rotor disks at which a ball passes them; it may be this large."""
 
 _NOMINAL: Final = SafetyAction.NOMINAL
 BALL_SEEN = EventDefinition("ball_seen", Severity.INFO, _NOMINAL, "a marker falls freely: it is a ball in flight")
@@ -287,7 +287,8 @@ class Intercept(Phase):
         plan = self._meeting(air, s, path, point.t_s)
         if plan is not None:
             return _planned(s, plan, plan.point.t_s - air.t_s)
-        if not self._clears(air, s, path, s.plan):
+        kept_m = self._clearance_m(air, s, path, s.plan)
+        if kept_m < BALL_M and kept_m < self._clearance_m(air, s, path, None):
             air.report(BALL_AT_ROTORS, "a ball flies through the rotor disks; the vehicle stops")
             return replace(s, mode=Mode.STOP)
         return s
@@ -336,27 +337,18 @@ class Intercept(Phase):
         return next((plan for plan in plans if self._clears(air, s, path, plan)), None)
 
     def _clears(self, air: Air, s: Interception, path: list[Point], plan: Plan | None) -> bool:
-        """Return whether a ball flies clear of the rotor disks before it is met; without a plan, those of the waiting vehicle."""
-        airframe, drop_m = air.vehicle.airframe, self._reach(air, s).drop_m
-        t_s, p, v = air.t_s, s.now.position_m, s.now.velocity_m_s
-        disks = [
-            quat_rotate(quat_from_euler_zyx(0.0, 0.0, s.home.yaw_rad), at)
-            for at in airframe.rotor_layout.positions_body_m
-        ]
-        ball_m = BALL_M if s.mode is Mode.WAIT else BALL_CHASED_M
-        for point in path:
-            if plan is not None:
-                if point.t_s >= plan.point.t_s:
-                    return True
-                h, a = point.t_s - t_s, plan.push_m_s2(point.t_s, drop_m)
-                vx, vy, vz = (u + h * w for u, w in zip(v, a, strict=True))
-                t_s, v, p = point.t_s, (vx, vy, vz), (p[0] + h * vx, p[1] + h * vy, p[2] + h * vz)
-            px, py, pz = (b - o for b, o in zip(point.position_m, p, strict=True))
-            near_m = ball_m + 0.5 * ball.STEP_S * abs(point.velocity_m_s[2])
-            for x, y, z in disks:
-                if abs(pz - z) < near_m and math.hypot(px - x, py - y) < airframe.disk_radius_m + ball_m:
-                    return False
-        return True
+        """Return whether a ball flies clear of the rotors before it is met; without a plan, those of the waiting vehicle."""
+        return self._clearance_m(air, s, path, plan) >= BALL_M
+
+    def _clearance_m(self, air: Air, s: Interception, path: list[Point], plan: Plan | None) -> float:
+        """Return the smallest distance of a ball from the rotors before it is met; without a plan, if the vehicle stops."""
+        if plan is None:
+            push = partial(_acceleration_m_s2, self._bounds(air, s).stop(air.t_s, s.now))
+        else:
+            push = partial(plan.push_m_s2, drop_m=self._reach(air, s).drop_m)
+            path = [point for point in path if point.t_s <= plan.point.t_s]
+        places = places_body_m(air.i.vehicle, s.home.yaw_rad, air.t_s, s.now, s.lag, path, push)
+        return clearance_m(air.vehicle.airframe, places)
 
 
 def _planned(s: Interception, plan: Plan, left_s: float) -> Interception:
@@ -365,6 +357,10 @@ def _planned(s: Interception, plan: Plan, left_s: float) -> Interception:
     predicted_s, replans = (left_s, 0) if before is None else (before.predicted_s, before.replans + 1)
     chase = ChaseState(predicted_s=predicted_s, replans=replans, relative_speed_m_s=speed_m_s)
     return replace(s, plan=plan, chase=chase)
+
+
+def _acceleration_m_s2(motion: Motion, t_s: float) -> Vec3:
+    return motion.at(t_s).acceleration_m_s2
 
 
 def _motion(r: Reference) -> tuple[Vec3, Vec3, Vec3]:
