@@ -135,13 +135,14 @@ class HeartbeatSender:
         if self._last is not None:
             self._client.send_heartbeat(self._last)
 
-    def goodbye(self, now: AutopilotStatus | None) -> None:
-        """Send the guardian a final heartbeat marked as goodbye, unless PX4 is armed: then send nothing, so that the guardian takes
-        over once this process has ended.
+    def goodbye(self, now: AutopilotStatus | None, *, lost: bool = False) -> None:
+        """Send the guardian a final heartbeat marked as goodbye; if PX4 may be armed, one that makes the guardian take over.
 
         Args:
             now: PX4's newest status; None if none was received.
+            lost: whether the flight does not know what became of the vehicle.
         """
-        if self._last is not None and not (now is not None and now.armed):
-            self._last = msgspec.structs.replace(self._last, goodbye=True)
+        if self._last is not None:
+            armed = lost or (now is not None and now.armed)
+            self._last = msgspec.structs.replace(self._last, goodbye=not armed, left_armed=armed)
             self._client.send_heartbeat(self._last)

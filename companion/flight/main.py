@@ -150,8 +150,9 @@ async def fly(
             if devices.team is not None:
                 counts = devices.team.counts()._asdict()
                 recorder.client.metadata("team_link", {name: str(count) for name, count in counts.items()})
-            if guardian is not None and outcome is not Outcome.LOST:
-                guardian.goodbye(devices.autopilot.status())
+            ipc.send(channel, FlightEnded(outcome))
+            if guardian is not None:
+                guardian.goodbye(devices.autopilot.status(), lost=outcome is Outcome.LOST)
         finally:
             report = await asyncio.to_thread(recorder.finish)
         ipc.send(channel, FlightEnded(outcome, Recorded(report.samples, report.dropped, report.error)))

@@ -40,6 +40,8 @@ class Heartbeat(Record, frozen=True, kw_only=True):
     """A pilot has taken over."""
     goodbye: bool
     """This is the last heartbeat: the flight ends normally."""
+    left_armed: bool = False
+    """This is the last heartbeat, and PX4 may be armed: the guardian takes over."""
     mocap_refused: bool
     """The flight process rejects motion capture and lands without it: poses must neither be sent to PX4 nor confirm the landing."""
     autopilot_system: _Byte

@@ -350,7 +350,8 @@ class Launcher:
 
     def _await_recorder(self) -> None:
         """Wait for the recorder to close the log if the flight process was killed; its pidfd is polled, as it is no child."""
-        if self._reports.recorder_pid is None or self._reports.result is not None:
+        result = self._reports.result
+        if self._reports.recorder_pid is None or (result is not None and result.recorded is not None):
             return
         try:
             pidfd = os.pidfd_open(self._reports.recorder_pid)

@@ -93,7 +93,7 @@ class FlightReports:
         if sitl is not None and sitl.ended:
             self.failures.append(sitl.exit_summary())
         elif guardian.took_over:
-            self.failures.append(_takeover_summary(guardian, code, log_path))
+            self.failures.append(_takeover_summary(guardian, code, log_path, ended=self.result is not None))
         elif code != expected:
             text = f"flight: the flight process {how_it_ended(code)}{last_line(log_path)}; see {log_path}"
             self.failures.append(text)
@@ -119,11 +119,13 @@ class FlightReports:
         return (*reasons, *(() if busy is None else (busy,)), *self.failures)
 
 
-def _takeover_summary(guardian: GuardianProcess, code: int, log_path: Path) -> str:
+def _takeover_summary(guardian: GuardianProcess, code: int, log_path: Path, *, ended: bool) -> str:
     vehicle = {
         Outcome.ABORTED: "the guardian landed the vehicle",
         Outcome.CRASHED: "the vehicle was flipped or tipped over, and the guardian stopped its rotors",
     }.get(guardian.outcome or Outcome.LOST, "the guardian could not confirm a landing")
     hung = guardian.takeover is not None and guardian.takeover.hangs
     what = "hung and was killed" if hung else f"{how_it_ended(code)}{last_line(log_path)}"
+    if ended:
+        what = "ended its flight while PX4 was armed, as far as it heard"
     return f"flight: the flight process {what}; {vehicle}; see {log_path}"

@@ -119,7 +119,7 @@ class FlightEnded(Record, frozen=True, tag=True):
 
 
 class TookOver(Record, frozen=True, tag=True):
-    """First message of a guardian that takes over: whether the flight process hangs, else it has died."""
+    """First message of a guardian that takes over: whether the flight process hangs, else it has died or ended its flight."""
 
     hangs: bool
 

@@ -188,15 +188,18 @@ def test_a_pilot_stays_one_and_a_rejected_pose_is_not_passed_on(pair: Pair, wait
     ]
 
 
-def test_while_px4_is_armed_no_goodbye_is_said_to_the_guardian(pair: Pair, waiting: Outputs) -> None:
-    """Whatever the outcome, the guardian must stop turning rotors once this process is gone."""
+def test_while_px4_may_be_armed_the_guardian_is_left_with_it_at_the_end(pair: Pair, waiting: Outputs) -> None:
+    """Whatever the outcome, the guardian must stop turning rotors."""
     client, guardian = pair
     guard = HeartbeatSender(client, LINK, 0.0)
     guard.tick(inputs(armed=True), msgspec.structs.replace(waiting, phase_kind=PhaseKind.DONE))
     guard.goodbye(inputs(armed=True).status)
+    guard.goodbye(inputs(armed=False).status, lost=True)
     guard.goodbye(inputs(armed=False).status)
-    beats = [heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) for _ in range(2)]
-    assert [beat is not None and (beat.goodbye, beat.lifting) for beat in beats] == [(False, True), (True, True)]
+    beats = [heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) for _ in range(4)]
+    assert [beat is not None and (beat.goodbye, beat.left_armed) for beat in beats] == [
+        (False, False), (False, True), (False, True), (True, False)
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("event_id", ["mocap_dragged", "mocap_two_streams", "mocap_swapped", "mocap_frozen"])

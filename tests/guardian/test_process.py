@@ -19,7 +19,7 @@ from companion.guardian.heartbeat import MAX_BYTES, PROBLEM, READY
 from companion.guardian.process import main
 from companion.launcher.guardian_process import outcome_of
 from companion.model.frames import attitude_enu_flu_from_ned_frd, ned_from_enu, wrap_rad
-from companion.model.launcher_messages import FlightEvent, GuardianEnded
+from companion.model.launcher_messages import FlightEvent, GuardianEnded, TookOver
 from companion.model.types import Outcome
 from tests.guardian.rig import DISARMED, HOLD_MODE, LAND_MODE, OWN_IDS, POSITION_M, Rig
 from tests.support import DEADLINE_S, wait_until
@@ -116,6 +116,20 @@ def test_dead_or_hanging_in_the_air_it_takes_over_and_lands(tmp_path: Path, numb
         assert (beat.type, beat.autopilot) == (mavlink.MAV_TYPE_ONBOARD_CONTROLLER, mavlink.MAV_AUTOPILOT_INVALID)
         assert len(rig.peer.commands(ARM_DISARM)) >= 1
         assert {m.param1 for m in rig.peer.commands(ARM_DISARM)} == {0.0}
+
+
+def test_a_flight_that_ends_with_px4_armed_is_taken_over_and_is_not_said_to_hang(tmp_path: Path) -> None:
+    with Rig(tmp_path) as rig:
+        rig.beat_until_ready()
+        rig.beat(left_armed=True)
+        rig.land()
+        assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
+        assert sound(rig.events) == ["guardian_took_over", "guardian_land", "guardian_landed"]
+        assert TookOver(hangs=False) in rig.messages
+        [first] = [m for m in rig.messages if isinstance(m, FlightEvent) and m.id == "guardian_took_over"]
+        assert (
+            first.text == "the flight process has ended its flight, and PX4 may be armed; the guardian has taken over"
+        )
 
 
 def test_a_full_disk_under_its_log_does_not_cost_the_landing(tmp_path: Path) -> None:
