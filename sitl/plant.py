@@ -22,6 +22,8 @@ from sitl.autopilot.types import Battery, ImuSample, RotorCommands
 from sitl.faults.injector import CELL_FULL_V, Faults
 from sitl.mocap import Mocap
 from sitl.servo.from_config import torque_constants_nm_a
+from sitl.world.effects import barometer
+from sitl.world.effects.barometer import Barometer
 from sitl.world.effects.force_sensor import ForceSensor
 from sitl.world.effects.imu import ImuErrors
 from sitl.world.effects.transmission import Transmission, transmissions_of
@@ -34,6 +36,8 @@ from sitl.world.state import PHYSICS_DT_S, Truth
 
 IMU_EVERY: Final = 2
 """Physics steps per IMU sample: 250 Hz, the rate of PX4's rate loop."""
+BARO_EVERY: Final = round(barometer.PERIOD_S / PHYSICS_DT_S)
+"""Physics steps per sample of the barometer."""
 CELL_EMPTY_V: Final = 3.5
 _COUNTS_PER_RAD = 4096.0 / (2.0 * math.pi)
 
@@ -148,6 +152,8 @@ class Plant:
             self.machine.add_joint_inertia(transmissions)
         hover_n = self.machine.weight_n / self.machine.rotor_count
         self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, hover_n, vehicle.airframe.rotor_layout)
+        rest_m, arm_m = vehicle.airframe.ground_clearance_m, vehicle.airframe.rotor_layout.arm_m
+        self._barometer = Barometer(config.barometer, self.machine.weight_n, rest_m, arm_m, config.seed)
         ball = vehicle.devices.mocap.ball
         self.mocap = Mocap(config, ball, self.scene, self.machine, between_steps=between_steps)
         self._seed_noise()
@@ -218,6 +224,7 @@ class Plant:
             if self._imu_errors is not None:
                 self._imu_errors.drift(noise(config.seed, _IMU_DRIFT))
             self.mocap.restart(t_s)
+            self._barometer.restart()
             if machine.battery is not None:
                 machine.battery.restart()
         if self.faults is not None:
@@ -271,7 +278,8 @@ class Plant:
             rates, force = self._imu_errors.measure(machine.thrust_n, rates, force)
         p, q, r = rates
         ax, ay, az = force
-        return ImuSample(self.scene.t_s, (p, -q, -r), (ax, -ay, -az))
+        baro_m = self._barometer.measure(machine.q[2], sum(machine.thrust_n)) if self._tick % BARO_EVERY == 0 else None
+        return ImuSample(self.scene.t_s, (p, -q, -r), (ax, -ay, -az), baro_m)
 
     def battery(self) -> Battery:
         """Return the power module's measurement; without the battery effect, the charge falls linearly since arming."""

@@ -15,6 +15,7 @@ from companion.model.servos import ServoName
 from companion.px4.defaults import PX4_DEFAULTS
 from companion.sitl_config.bar import Bar
 from companion.sitl_config.effects.air import Air
+from companion.sitl_config.effects.barometer import Barometer
 from companion.sitl_config.effects.battery import Battery
 from companion.sitl_config.effects.compliance import Compliance
 from companion.sitl_config.effects.downwash import Downwash
@@ -208,6 +209,7 @@ class World(Model):
     machine: Machine = Machine()
     force_sensor: ForceSensor = ForceSensor()
     imu: Imu = Imu()
+    barometer: Barometer = Barometer()
     mocap: Mocap = Mocap()
     markers: Markers = Markers()
     net: Net = Net()

@@ -148,6 +148,8 @@ class Px4Stub:
         if t_s < self.booted_at_s:
             return self._stopped
         self._estimator.predict(imu)
+        if imu.baro_m is not None and self.params.integer("EKF2_BARO_CTRL"):
+            self._estimator.fuse_barometer(imu.baro_m)
         self.estimate = estimate = self._estimator.estimate()
         queue = self._queue
         while queue and queue[0][0] <= t_s + _TIME_EPSILON_S:
@@ -338,6 +340,7 @@ class Px4Stub:
         return Health(
             attitude_valid=estimate is not None and estimate.attitude_valid,
             position_valid=estimate is not None and estimate.position_valid,
+            height_valid=estimate is not None and estimate.height_valid,
             origin_set=origin_set,
             home_set=origin_set and self.home_ned_m is not None,
             landed=self.land.landed,
@@ -362,4 +365,4 @@ def _without(imu: ImuSample, learned: LearnedBias) -> ImuSample:
     p, q, r = imu.gyro_frd_rad_s
     x, y, z = imu.accel_frd_m_s2
     bp, bq, br = learned.gyro_frd_rad_s
-    return ImuSample(imu.t_s, (p - bp, q - bq, r - br), (x, y, z - learned.accel_down_m_s2))
+    return ImuSample(imu.t_s, (p - bp, q - bq, r - br), (x, y, z - learned.accel_down_m_s2), imu.baro_m)

@@ -65,7 +65,7 @@ class LandDetector:
         self._landed_since_s, self.landed = _held(t_s, self.maybe_landed, self._landed_since_s, hold_s)
 
     def _contact_now(self, estimate: Estimate, thrust: float, climb_rate_controlled: bool, descend_m_s: float) -> bool:
-        if not estimate.position_valid:
+        if not estimate.height_valid:
             return False
         settings = self._settings
         # The hover thrust estimator runs only in climb-rate-controlled modes; there PX4 trusts the hover thrust more.
@@ -76,7 +76,8 @@ class LandDetector:
             return False
         vx, vy, vz = estimate.velocity_ned_m_s
         still_m_s = settings.still_z_m_s * (2.5 if self.maybe_landed else 1.0)
-        return abs(vz) <= still_m_s and math.hypot(vx, vy) <= settings.still_xy_m_s
+        moves = estimate.position_valid and math.hypot(vx, vy) > settings.still_xy_m_s
+        return abs(vz) <= still_m_s and not moves
 
     def _maybe_now(self, t_s: float, estimate: Estimate, thrust: float, climb_rate_controlled: bool) -> bool:
         settings = self._settings
@@ -92,7 +93,7 @@ class LandDetector:
         p, q, _ = estimate.rates_frd_rad_s
         if math.hypot(p, q) > turning_rad_s:
             return False
-        if estimate.position_valid:
+        if estimate.height_valid:
             return self.ground_contact
         return t_s - self._low_since_s > _BLIND_S
 

@@ -102,6 +102,7 @@ class Health:
 
     attitude_valid: bool
     position_valid: bool
+    height_valid: bool
     origin_set: bool
     """Whether SET_GPS_GLOBAL_ORIGIN was received, so that the global position is known as well."""
     home_set: bool
@@ -134,7 +135,9 @@ class Health:
         match need:
             case Need.ATTITUDE:
                 return self.attitude_valid
-            case Need.LOCAL_ALTITUDE | Need.LOCAL_POSITION:
+            case Need.LOCAL_ALTITUDE:
+                return self.height_valid
+            case Need.LOCAL_POSITION:
                 return self.position_valid
             case Need.GLOBAL_POSITION:
                 return self.position_valid and self.origin_set

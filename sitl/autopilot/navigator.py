@@ -128,7 +128,7 @@ class Navigator:
         if self._state is NavState.OFFBOARD:
             return offboard or _LEVEL_IDLE
         if self._state is NavState.DESCEND:
-            if not estimate.position_valid:
+            if not estimate.height_valid:
                 return PositionTarget(acceleration_ned_m_s2=(None, None, _BLIND_DESCENT_M_S2))
             return PositionTarget(velocity_ned_m_s=(None, None, self._descent(dt_s, estimate, home_ned_m)))
         if self._state is NavState.RTL and home_ned_m is not None and not self._descending:

@@ -186,8 +186,10 @@ def estimator_status(stub: Px4Stub) -> Message | None:
     if estimate is None:
         return None
     flags = mavlink.ESTIMATOR_ATTITUDE if estimate.attitude_valid else 0
+    if estimate.height_valid:
+        flags |= mavlink.ESTIMATOR_VELOCITY_VERT
     if estimate.position_valid:
-        flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_VELOCITY_VERT | mavlink.ESTIMATOR_POS_HORIZ_REL
+        flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_REL
         flags |= mavlink.ESTIMATOR_POS_HORIZ_ABS if stub.origin is not None else 0
     if estimate.vision_fused:
         flags |= mavlink.ESTIMATOR_POS_VERT_ABS | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL

@@ -18,6 +18,8 @@ class ImuSample(NamedTuple):
     gyro_frd_rad_s: Vec3
     accel_frd_m_s2: Vec3
     """Specific force; (0, 0, -9.81) for a level vehicle at rest."""
+    baro_m: float | None = None
+    """Barometric height above the floor; None between the samples of the barometer."""
 
 
 class LearnedBias(NamedTuple):
@@ -39,7 +41,9 @@ class Estimate(NamedTuple):
     vision_fused: bool
     """Whether vision was fused within the last 0.55 s (like PX4's EV flags)."""
     position_valid: bool
-    """xy_valid and z_valid of vehicle_local_position: true until 4.5 s after vision was last fused."""
+    """xy_valid of vehicle_local_position: true until 4.5 s after vision was last fused."""
+    height_valid: bool
+    """z_valid: as long, and longer with a barometer."""
     attitude_valid: bool
 
 

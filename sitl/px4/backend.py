@@ -246,10 +246,10 @@ class RealPx4(AutopilotBackend):
         await self._boot(BOOT_DEADLINE_S if self._process is not None else USER_DEADLINE_S)
 
     def sense(self, imu: ImuSample) -> None:
-        """Send HIL_SENSOR with this IMU sample and the present true height and attitude."""
+        """Send HIL_SENSOR with this IMU sample and the magnetic field at the present true attitude."""
         self._imu = imu
         q = self._machine.q
-        self._link.send(imu, q[2], (q[3], q[4], q[5], q[6]))
+        self._link.send(imu, (q[3], q[4], q[5], q[6]))
 
     async def answered(self) -> None:
         """Wait for the HIL_ACTUATOR_CONTROLS that answers the newest sample.

@@ -28,8 +28,8 @@ ANSWER_PATIENCE_S = 2.0
 """Timeout for the answer to one sample; then the next sample is sent."""
 ANSWER_DEADLINE_S = 10.0
 """Time without any answer after which PX4 counts as hung."""
-FIELD_EVERY, BARO_OFFSET = 5, 2
-"""Every fifth sample includes the magnetometer, and every fifth, at this offset, the barometer: 50 Hz each."""
+FIELD_EVERY, FIELD_OFFSET = 5, 2
+"""Every fifth sample includes the magnetometer: 50 Hz."""
 
 _ACCEL_AND_GYRO, _MAG, _BARO = 0x07 | 0x38, 0x1C0, 0x200 | 0x800 | 0x1000
 _GROUND_ALTITUDE_M = 488.0
@@ -57,27 +57,25 @@ def field_frd_gauss(attitude_wxyz: Quat) -> Vec3:
 class HilSensors:
     """Builds the HIL_SENSOR messages of one flight.
 
-    PX4 does not boot without a magnetometer and a barometer, even if it does not fuse them, so both are given plausible, noisy
-    values.
+    PX4 does not boot without a magnetometer and a barometer, even if it does not fuse them, so both have plausible, noisy values.
     """
 
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
         self._number = 0
 
-    def message(self, imu: ImuSample, height_m: float, attitude_wxyz: Quat) -> Any:
+    def message(self, imu: ImuSample, attitude_wxyz: Quat) -> Any:
         """Return the HIL_SENSOR message of one sample.
 
         Args:
             imu: IMU sample, with its time counted from PX4's first sample.
-            height_m: true height above the floor.
             attitude_wxyz: true attitude, body FLU to world ENU.
         """
         gauss = self._random.gauss
         fields = _ACCEL_AND_GYRO
         field: Vec3 = (0.0, 0.0, 0.0)
         pressure = altitude_m = 0.0
-        if self._number % FIELD_EVERY == 0:
+        if self._number % FIELD_EVERY == FIELD_OFFSET:
             fields |= _MAG
             x, y, z = field_frd_gauss(attitude_wxyz)
             field = (
@@ -85,9 +83,9 @@ class HilSensors:
                 y + gauss(0.0, _FIELD_NOISE_GAUSS),
                 z + gauss(0.0, _FIELD_NOISE_GAUSS),
             )
-        elif self._number % FIELD_EVERY == BARO_OFFSET:
+        if imu.baro_m is not None:
             fields |= _BARO
-            altitude_m = _GROUND_ALTITUDE_M + height_m
+            altitude_m = _GROUND_ALTITUDE_M + imu.baro_m
             pressure = pressure_hpa(altitude_m) + gauss(0.0, _PRESSURE_NOISE_HPA)
         self._number += 1
         return mavlink.MAVLink_hil_sensor_message(
@@ -176,13 +174,13 @@ class SimulatorLink:
                     await self._change.wait()
         return bool(reached())
 
-    def send(self, imu: ImuSample, height_m: float, attitude_wxyz: Quat) -> None:
+    def send(self, imu: ImuSample, attitude_wxyz: Quat) -> None:
         """Send one sample to PX4, if one is connected; `answered` waits for the answer."""
         if self._peer is None:
             return
         if self.clock_begun_s is None:
             self.clock_begun_s = imu.t_s
-        message = self._sensors.message(imu._replace(t_s=imu.t_s - self.clock_begun_s), height_m, attitude_wxyz)
+        message = self._sensors.message(imu._replace(t_s=imu.t_s - self.clock_begun_s), attitude_wxyz)
         # A PX4 that is booting or idle does not answer.
         self._awaited_us = int(message.time_usec) if self.answers and not self._idle else None
         self._peer.write(message.pack(self._encoder))

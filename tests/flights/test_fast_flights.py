@@ -97,6 +97,22 @@ def test_a_lost_device_lands_it(kind: str, at_s: float) -> None:
         assert max(abs(a - b) for a, b in zip(folded, FOLDED_DEG, strict=True)) < 12
 
 
+@pytest.mark.parametrize(("barometer", "outcome"), [(1, Outcome.ABORTED), (0, Outcome.LOST)])
+def test_px4_whose_link_is_dead_finds_the_floor_by_its_barometer(barometer: int, outcome: Outcome) -> None:
+    """In take-off, in a laboratory whose IMU drifts sideways by more than PX4's land detector accepts."""
+    config = load_sitl(
+        "configs/missions/catch.yaml",
+        overrides=[
+            "world.faults=[{kind: link_loss, phase: takeoff}]",
+            f"world.px4_params={{EKF2_BARO_CTRL: {barometer}}}",
+        ],
+        world="lab",
+    )
+    flight = FastFlight(config)
+    assert flight.run().outputs[-1].outcome is outcome
+    assert flight.px4.armed == (outcome is Outcome.LOST)
+
+
 def test_without_force_sensor_the_mission_goes_on() -> None:
     result = FastFlight(short("world.faults=[{kind: force_loss, t_s: 3.2}]")).run()
     assert result.outputs[-1].outcome is Outcome.COMPLETED

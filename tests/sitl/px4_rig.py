@@ -90,6 +90,8 @@ class Rig:
         self.plant = Plant()
         self.t_s = 0.0
         self.vision = True
+        self.baro_error_m = 0.0
+        self._samples = 0
         self._vision_at_s = 0.0
 
     @property
@@ -98,7 +100,10 @@ class Rig:
 
     def step(self) -> None:
         self.t_s += PERIOD_S
-        self.stub.step(self.plant.step(self.t_s, PERIOD_S, self.stub.rotors))
+        sample = self.plant.step(self.t_s, PERIOD_S, self.stub.rotors)
+        self._samples += 1
+        baro_m = self.height_m + self.baro_error_m if self._samples % 5 == 0 else None
+        self.stub.step(sample._replace(baro_m=baro_m))
         if self.vision and self.t_s >= self._vision_at_s:
             self._vision_at_s = self.t_s + VISION_PERIOD_S
             self.stub.on_vision(self.t_s, self.plant.position_ned_m, self.plant.attitude)

@@ -23,7 +23,7 @@ PERIOD_S = 0.004
 
 
 def sample(i: int) -> ImuSample:
-    return ImuSample(i * PERIOD_S, (0.1, 0.2, 0.3), (0.0, 0.0, -9.81))
+    return ImuSample(i * PERIOD_S, (0.1, 0.2, 0.3), (0.0, 0.0, -9.81), 1.0 if i % 5 == 0 else None)
 
 
 @contextlib.asynccontextmanager
@@ -40,7 +40,7 @@ async def boot(link: SimulatorLink, i: int = 0) -> int:
     """Send samples until the first answer; return the number of the next sample."""
     async with asyncio.timeout(DEADLINE_S):
         while not link.in_step:
-            link.send(sample(i), 0.3, LEVEL)
+            link.send(sample(i), LEVEL)
             await link.await_lockstep(PERIOD_S)
             i += 1
     return i
@@ -49,7 +49,7 @@ async def boot(link: SimulatorLink, i: int = 0) -> int:
 async def step(link: SimulatorLink, numbers: Iterable[int]) -> None:
     async with asyncio.timeout(DEADLINE_S):
         for i in numbers:
-            link.send(sample(i), 0.3, LEVEL)
+            link.send(sample(i), LEVEL)
             await link.answered()
 
 
@@ -91,7 +91,7 @@ async def test_a_px4_that_rests_on_the_ground_is_not_waited_for(monkeypatch: pyt
                 i, waited = 300, False
                 while not waited:
                     i += 1
-                    link.send(sample(i), 0.3, LEVEL)
+                    link.send(sample(i), LEVEL)
                     waited = link.pending
                     await link.answered()
                     await asyncio.sleep(PERIOD_S)
@@ -126,7 +126,7 @@ async def test_a_px4_that_leaves_stops_the_rotors_and_may_come_back() -> None:
         with await peer_of(link):
             i = await boot(link)
             assert link.rotors == (0.5, 0.5, 0.5, 0.5)
-            link.send(sample(i), 0.3, LEVEL)
+            link.send(sample(i), LEVEL)
         assert await link.await_disconnect(DEADLINE_S)
         await link.answered()  # what was pending will never come
         assert link.rotors == (0.0, 0.0, 0.0, 0.0)
@@ -168,7 +168,7 @@ async def test_a_second_px4_is_rejected() -> None:
 
 def test_what_px4_senses() -> None:
     sensors = HilSensors(1)
-    messages = [sensors.message(sample(i), 1.0, LEVEL) for i in range(250)]
+    messages = [sensors.message(sample(i), LEVEL) for i in range(250)]
     accel_and_gyro = 0b111111
     assert all(message.fields_updated & accel_and_gyro == accel_and_gyro for message in messages)
     assert sum(message.fields_updated >> 6 & 1 for message in messages) == 50, "magnetometer, Hz"

@@ -68,7 +68,7 @@ async def test_it_runs_in_its_folder_and_ends_when_asked(tmp_path: Path) -> None
                     t_s = 0.0
                     while not link.in_step:
                         t_s += 0.004
-                        link.send(ImuSample(t_s, (0.0, 0.0, 0.0), (0.0, 0.0, -9.81)), 0.3, (1.0, 0.0, 0.0, 0.0))
+                        link.send(ImuSample(t_s, (0.0, 0.0, 0.0), (0.0, 0.0, -9.81), 0.3), (1.0, 0.0, 0.0, 0.0))
                         await link.await_lockstep(0.004)
                 left = f"/tmp/px4-sock-{instance.number}"  # PX4 leaves it there also at an orderly end
                 with contextlib.suppress(FileExistsError):

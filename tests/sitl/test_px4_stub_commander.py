@@ -14,13 +14,14 @@ from sitl.autopilot.params import Params
 GOOD = Health(
     attitude_valid=True,
     position_valid=True,
+    height_valid=True,
     origin_set=True,
     home_set=True,
     landed=True,
     maybe_landed=True,
     setpoint_age_s=0.02,
 )
-BLIND = replace(GOOD, position_valid=False)
+BLIND = replace(GOOD, position_valid=False, height_valid=False)
 FLYING = replace(GOOD, landed=False, maybe_landed=False)
 LOSS_S = 0.5
 

@@ -59,6 +59,21 @@ def test_an_upward_bias_that_begins_in_flight_fades_as_slowly_as_in_ekf2() -> No
     assert climbs[10000] / climbs[500] == pytest.approx(math.exp(-38.0 * 1.0 / 38.5), rel=0.1)
 
 
+def test_the_barometer_is_the_height_only_without_vision_and_its_offset_is_known_by_then() -> None:
+    estimator, heights = Estimator(), {}
+    for k in range(20000):
+        estimator.predict(ImuSample(k * 0.004, (0.0, 0.0, 0.0), (0.0, 0.0, -GRAVITY_M_S2)))
+        if k < 10000 and k % 2 == 0:
+            estimator.fuse_vision(k * 0.004, (0.0, 0.0, 0.0), IDENTITY_QUAT)
+        if k % 5 == 0:
+            estimator.fuse_barometer(0.7 if k < 11000 else 1.2)
+        heights[k] = -estimator.estimate().position_ned_m[2]
+    assert max(abs(heights[k]) for k in range(11000)) < 0.02, "0.7 m of offset"
+    assert heights[11500] < 0.08, "a gust on the barometer hardly moves it in 2 s"
+    assert heights[19999] > 0.3
+    assert estimator.estimate().height_valid and not estimator.estimate().position_valid
+
+
 AT_REST_FUSED = 0x1AF  # and velocities, relative and vertical position, aiding
 
 

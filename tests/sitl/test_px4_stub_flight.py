@@ -75,8 +75,8 @@ def test_offboard_follows_position_and_velocity_setpoints() -> None:
 
 
 def test_a_landing_that_ends_before_the_estimate_expires_disarms() -> None:
-    """Without position PX4 wants 8 s of idle thrust to believe that it has landed; the rotors stay idle meanwhile."""
-    rig = hovering()
+    """Without a height PX4 wants 8 s of idle thrust to believe that it has landed; the rotors stay idle meanwhile."""
+    rig = hovering(EKF2_BARO_CTRL=0)
     rig.vision = False
     rig.run(0.15)
     rig.command(Command.NAV_LAND)
@@ -87,4 +87,18 @@ def test_a_landing_that_ends_before_the_estimate_expires_disarms() -> None:
     assert not rig.stub.landed, "the position is invalid by now"
     assert rig.stub.target.thrust == 0.0
     run_until(rig, lambda: not rig.stub.armed, 12.0)
+    assert rig.height_m == 0.0
+
+
+def test_with_a_barometer_that_is_a_metre_off_it_finds_the_floor_after_the_position_has_expired() -> None:
+    rig = hovering(EKF2_BARO_CTRL=1)
+    rig.baro_error_m = 1.0
+    rig.run(20.0)
+    assert rig.height_m == pytest.approx(1.0, abs=0.15), "poses hold the height"
+    rig.vision = False
+    rig.run(4.6)
+    assert rig.stub.estimate is not None and rig.stub.estimate.height_valid and not rig.stub.estimate.position_valid
+    assert rig.stub.nav_state is NavState.DESCEND
+    run_until(rig, lambda: rig.stub.landed, 6.0)
+    run_until(rig, lambda: not rig.stub.armed, 2.5)
     assert rig.height_m == 0.0
