@@ -8,7 +8,7 @@ from typing import Protocol
 
 from companion.config.loader import FlightConfig
 from companion.flight.heartbeat import HeartbeatSender
-from companion.model.flight_stage import flown_by_pilot
+from companion.model.flight_stage import HEARTBEAT_FRESH_S, flown_by_pilot
 from companion.model.launcher_messages import HandedOver
 from companion.model.types import AutopilotRequest, AutopilotStatus, Outcome
 from companion.runtime import ipc
@@ -49,7 +49,7 @@ async def land_without_core(
         now = autopilot.status()
         if now is not None and not now.armed and clock() - start_s > STATUS_MIN_AGE_S:
             return Outcome.ABORTED
-        if flown_by_pilot(now):
+        if now is not None and clock() - now.heartbeat_stamp_s < HEARTBEAT_FRESH_S and flown_by_pilot(now):
             start_s = clock()
         else:
             autopilot.request(AutopilotRequest.LAND)

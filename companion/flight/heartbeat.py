@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
+from companion.core.sequence import ARMED_SHOWN_S
 from companion.guardian.client import GuardianClient
 from companion.guardian.heartbeat import Heartbeat
 from companion.model.best_pose import best_pose, pose_used_s
@@ -41,6 +42,8 @@ class Heartbeats:
         self._identity = identity
         self._origin_s = origin_s
         self._pilot = False
+        self._arm_s = float("-inf")
+        """When arming was last requested."""
         self._lands_without_mocap = False
         """Whether an event of `_REFUSALS` has occurred. From then on, an untrusted pose means that motion capture is rejected, not
         merely that a single pose is invalid.
@@ -61,7 +64,9 @@ class Heartbeats:
             self._position_world_m, self._attitude_wxyz = pose.position_world_m, pose.attitude_wxyz
         armed = inputs.status is not None and inputs.status.armed
         # PX4 reports only once a second whether it is armed, so it may be armed as soon as arming is requested.
-        may_lift = armed or outputs.request is AutopilotRequest.ARM or outputs.phase_kind in _IN_THE_AIR
+        if outputs.request is AutopilotRequest.ARM:
+            self._arm_s = inputs.t_s
+        may_lift = armed or inputs.t_s - self._arm_s <= ARMED_SHOWN_S or outputs.phase_kind in _IN_THE_AIR
         link = self._identity
         return Heartbeat(
             tick=inputs.tick,
@@ -135,14 +140,16 @@ class HeartbeatSender:
         if self._last is not None:
             self._client.send_heartbeat(self._last)
 
-    def goodbye(self, now: AutopilotStatus | None, *, lost: bool = False) -> None:
-        """Send the guardian a final heartbeat marked as goodbye; if PX4 may be armed, one that makes the guardian take over.
+    def goodbye(self, now: AutopilotStatus | None, *, lost: bool = False) -> bool:
+        """Send the guardian a final heartbeat; return whether it takes over, because PX4 may be armed.
 
         Args:
             now: PX4's newest status; None if none was received.
             lost: whether the flight does not know what became of the vehicle.
         """
-        if self._last is not None:
-            armed = lost or (now is not None and now.armed)
-            self._last = msgspec.structs.replace(self._last, goodbye=not armed, left_armed=armed)
-            self._client.send_heartbeat(self._last)
+        if self._last is None:
+            return False
+        armed = (lost and self._last.lifting) or (now is not None and now.armed)
+        self._last = msgspec.structs.replace(self._last, goodbye=True, lifting=armed)
+        self._client.send_heartbeat(self._last)
+        return armed and self.ready

@@ -62,6 +62,10 @@ def plugins_of_others(config: FlightConfig) -> dict[str, str]:
     return ({"device_plugins": "; ".join(found)} if found else {}) | versions
 
 
+TAKEOVER_S = 0.5
+"""Time within which a guardian that has to take over at the end has done so."""
+
+
 async def fly(
     config: FlightConfig,
     out: Path,
@@ -151,8 +155,8 @@ async def fly(
                 counts = devices.team.counts()._asdict()
                 recorder.client.metadata("team_link", {name: str(count) for name, count in counts.items()})
             ipc.send(channel, FlightEnded(outcome))
-            if guardian is not None:
-                guardian.goodbye(devices.autopilot.status(), lost=outcome is Outcome.LOST)
+            if guardian is not None and guardian.goodbye(devices.autopilot.status(), lost=outcome is Outcome.LOST):
+                await asyncio.sleep(TAKEOVER_S)  # the guardian ends this process, and goes on in the open log
         finally:
             report = await asyncio.to_thread(recorder.finish)
         ipc.send(channel, FlightEnded(outcome, Recorded(report.samples, report.dropped, report.error)))

@@ -35,13 +35,11 @@ class Heartbeat(Record, frozen=True, kw_only=True):
     mission_t_s: float
     """Time since take-off was commanded; 0 before that."""
     lifting: bool
-    """The rotors are turning or may be about to turn."""
+    """The rotors are turning or may be about to turn; in the last heartbeat: PX4 may be armed."""
     pilot: bool
     """A pilot has taken over."""
     goodbye: bool
-    """This is the last heartbeat: the flight ends normally."""
-    left_armed: bool = False
-    """This is the last heartbeat, and PX4 may be armed: the guardian takes over."""
+    """This is the last heartbeat: the flight has ended."""
     mocap_refused: bool
     """The flight process rejects motion capture and lands without it: poses must neither be sent to PX4 nor confirm the landing."""
     autopilot_system: _Byte

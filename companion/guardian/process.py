@@ -113,12 +113,10 @@ class Guardian:
                 self._mocap.keep_connected()
                 self._mocap.poses()
             if last is not None and last.goodbye:
-                return None
+                return "the flight process has ended its flight, and PX4 may be armed" if last.lifting else None
             lifting = last is not None and last.lifting
             if dead:
                 return "the flight process died" if lifting else None
-            if last is not None and last.left_armed and lifting:
-                return "the flight process has ended its flight, and PX4 may be armed"
             hangs = watch.update(now_s, heard or not lifting)
             self._silent_s = max(self._silent_s, watch.silent_s)
             if hangs:

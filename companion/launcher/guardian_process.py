@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from companion.model.launcher_messages import FlightEvent, GuardianEnded, Message, TookOver
@@ -27,6 +27,7 @@ class GuardianProcess:
         heartbeats: the guardian's end of the socket to the flight process; closed here.
         shared: descriptors that the guardian keeps open for the simulated world.
         in_time: arguments of simulated time; empty in real time.
+        clock: the time that the guardian lives in, s.
     """
 
     def __init__(
@@ -37,7 +38,9 @@ class GuardianProcess:
         heartbeats: socket.socket,
         shared: Sequence[int],
         in_time: Sequence[str] = (),
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._clock = clock
         self.log = out / "guardian.log"
         self.channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.channel.setblocking(False)
@@ -77,7 +80,7 @@ class GuardianProcess:
         self.result: GuardianEnded | None = None
         self.open = True
         """Whether the guardian's end of the channel is open."""
-        self._heard_s = time.monotonic()
+        self._heard_s = self._clock()
 
     @property
     def outcome(self) -> Outcome | None:
@@ -97,7 +100,7 @@ class GuardianProcess:
             if message is None:
                 self.open = False
                 break
-            self._heard_s = time.monotonic()
+            self._heard_s = self._clock()
             self.took_over = True
             heard.append(message)
             match message:
@@ -111,7 +114,7 @@ class GuardianProcess:
 
     def hangs(self) -> bool:
         """Return whether the guardian has taken over but has been silent for longer than `SILENT_S`."""
-        return self.open and self.took_over and time.monotonic() - self._heard_s > SILENT_S
+        return self.open and self.took_over and self._clock() - self._heard_s > SILENT_S
 
     def stop(self, patience_s: float) -> None:
         """Wait up to `patience_s` for the guardian to exit by itself, as it does after a flight; then end it."""

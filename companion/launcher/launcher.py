@@ -56,6 +56,8 @@ FLIGHT_SILENT_TIMEOUT_S = 5.0
 """Silence after which the launcher treats the flight process as hung. The guardian does not act on the ground and may
 be dead. Once the flight process is killed, PX4 lands by its own offboard-loss failsafe.
 """
+ENDING_TIMEOUT_S = 30.0
+"""The same after the flight: closing the log takes 10 s at most."""
 GUARDIAN_EXIT_TIMEOUT_S = 5.0
 """Time allowed for a guardian that has not taken over to exit after the flight process has ended."""
 RECORDER_CLOSE_TIMEOUT_S = 10.0
@@ -221,7 +223,7 @@ class Launcher:
                 in_time, inherited = ((), ()) if self._time is None else self._time.of("guardian")
                 shared = (*shared, *inherited)
                 self._guardian = guardian = GuardianProcess(
-                    config_path, self._out, process.pid, heartbeats_in, shared, in_time
+                    config_path, self._out, process.pid, heartbeats_in, shared, in_time, self._now_s
                 )
                 if self._time is not None:
                     self._time.started("flight")
@@ -253,7 +255,7 @@ class Launcher:
     ) -> None:
         """Forward the messages of flight and guardian until both have closed their channels; kill a process that hangs."""
         flight_open = True
-        flight_open_s = time.monotonic()
+        flight_open_s = guardian_open_s = time.monotonic()
         heard_s = self._now_s()
         while flight_open or guardian.open:
             channels = [channel] * flight_open + [guardian.channel] * guardian.open
@@ -273,20 +275,26 @@ class Launcher:
             now_s = time.monotonic()
             self._cpu_contention.sample(now_s)
             self._report_pace()
+            if flight_open:
+                flight_open_s = now_s
+            if guardian.open:
+                guardian_open_s = now_s
+            silent_max_s = FLIGHT_SILENT_TIMEOUT_S if self._reports.flying else ENDING_TIMEOUT_S
             if channel in readable:
                 heard_s = self._now_s()
                 flight_open = self._receive(channel)
             elif flight_open and process.poll() is not None:
                 self._receive(channel)  # its last messages may have come after `select`
                 flight_open = False
-            elif flight_open and self._reports.flying and not guardian.took_over and self._silent(heard_s):
-                text = f"flight: the flight process sent nothing for {FLIGHT_SILENT_TIMEOUT_S:g} s and was killed"
+            elif flight_open and guardian.took_over:
+                if now_s - guardian_open_s > GUARDIAN_EXIT_TIMEOUT_S:  # killed, and not even that ends it
+                    return
+            elif flight_open and self._reports.begun and self._now_s() - heard_s > silent_max_s:
+                text = f"flight: the flight process sent nothing for {silent_max_s:g} s and was killed"
                 self._reports.failures.append(text)
                 process.kill()
-            if flight_open:
-                flight_open_s = now_s
             alone_s = now_s - flight_open_s
-            if guardian.hangs() or (not guardian.took_over and alone_s > GUARDIAN_EXIT_TIMEOUT_S):
+            if guardian.hangs() or (guardian.open and not guardian.took_over and alone_s > GUARDIAN_EXIT_TIMEOUT_S):
                 self._reports.failures.append("guardian: the guardian process hung and was killed")
                 guardian.process.kill()
                 return
@@ -294,9 +302,6 @@ class Launcher:
     def _now_s(self) -> float:
         """Return the time that the flight lives in."""
         return time.monotonic() if self._time is None else self._time.now_s()
-
-    def _silent(self, heard_s: float) -> bool:
-        return self._now_s() - heard_s > FLIGHT_SILENT_TIMEOUT_S
 
     def _measure_pace(self) -> None:
         if self._time is None:

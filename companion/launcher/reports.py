@@ -13,6 +13,7 @@ from companion.model.exit_codes import EXIT_CODES
 from companion.model.launcher_messages import (
     FlightEnded,
     FlightEvent,
+    HandedOver,
     Message,
     Px4Text,
     RefusedFlight,
@@ -24,6 +25,7 @@ from companion.model.types import Outcome, PhaseKind
 from companion.runtime.subprocesses import holds_traceback, how_it_ended, last_line
 
 LAND_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_SAID_BY_CODE = {EXIT_CODES[outcome]: outcome for outcome in (Outcome.COMPLETED, Outcome.ABORTED)}
 
 
 class FlightReports:
@@ -39,6 +41,8 @@ class FlightReports:
         self.events: list[dict[str, Any]] = []
         self.failures: list[str] = []
         """Lines about processes that failed."""
+        self._handed_over = False
+        """Whether the flight process has left the vehicle to PX4's landing."""
         self._refused: Sequence[str] | None = None
         self._critical_events: list[tuple[int, str]] = []
         """Tick and text of the events that end a flight; those of the first tick are the cause, later ones its consequences."""
@@ -49,7 +53,9 @@ class FlightReports:
         """Take a message of the flight process."""
         match message:
             case FlightEnded():
-                self.result = message
+                self.result, self.flying = message, False
+            case HandedOver():
+                self._handed_over = True
             case RefusedFlight():
                 self._refused = message.lines
             case Started():
@@ -79,15 +85,19 @@ class FlightReports:
         expected: int | None
         if self._refused is not None:
             outcome, expected = Outcome.REFUSED, EXIT_CODES[Outcome.REFUSED]
+        elif self.result is not None and self.result.outcome is Outcome.CRASHED:
+            outcome, expected = Outcome.CRASHED, EXIT_CODES[Outcome.CRASHED]
         elif guardian.outcome is not None:
             outcome, expected = guardian.outcome, None
-        elif self.result is not None and code >= 0:
+        elif self.result is not None:
             outcome = self.result.outcome
             expected = EXIT_CODES[outcome]
         elif self.recorder_pid is None and stop_requested and -code in LAND_SIGNALS:
             outcome, expected = Outcome.ABORTED, code  # it has received Ctrl-C itself, before it could leave the group
-        elif self.recorder_pid is None:
+        elif self.recorder_pid is None and not self._handed_over:
             outcome, expected = Outcome.REFUSED, None  # it never started, so nothing was armed
+        elif code in _SAID_BY_CODE:  # this process stood still, and its channel was full
+            outcome, expected = _SAID_BY_CODE[code], code
         else:
             outcome, expected = Outcome.LOST, None
         if sitl is not None and sitl.ended:

@@ -30,8 +30,8 @@ def receive(channel: socket.socket) -> Message | None:
     """Return one message, `Unreadable` for a malformed one, or None if the peer has closed the channel."""
     try:
         packet = channel.recv(MAX_MESSAGE_BYTES + 1)
-    except ConnectionResetError:
-        return None
+    except ConnectionResetError:  # said once, before what is still queued
+        return receive(channel)
     if not packet:
         return None
     try:

@@ -64,6 +64,8 @@ LATE_STANDS_S: Final = 1.5
 """Poses that are too late for PX4 show a touchdown after this time near the floor without vertical motion."""
 STANDING_S = 3.0
 TIMEOUT_S = 30.0
+PILOT_S: Final = 1.0
+"""While a pilot flies, the landing counts as begun this time ago."""
 FLIPPED: Final = "flipped: FORCE_DISARM is requested at once"
 KILLED: Final = "PX4's kill switch or flight termination has stopped the rotors; nothing is sent to PX4 any more"
 TIPPED: Final = "tipped over on the floor: FORCE_DISARM is requested at once"
@@ -201,12 +203,14 @@ class AutopilotLanding:
                 return replace(now, pilot=True), LandingStep(
                     request=AutopilotRequest.NONE, zero_thrust=False, ended=False, landed=False, text=text
                 )
+        if now.pilot and heard and is_armed(i.status):  # a pilot may fly for any length of time
+            now = replace(now, start_s=max(now.start_s, i.t_s - PILOT_S))
         if heard and not is_armed(i.status) and elapsed > 0.5:
             overturned = "the vehicle was flipped or tipped over; it is disarmed" if now.overturned else None
             return now, LandingStep(
                 request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=True, text=overturned
             )
-        if elapsed > TIMEOUT_S and not (now.pilot and heard):  # a pilot may fly for any length of time
+        if i.t_s - now.start_s > TIMEOUT_S:
             text = "the landing could not be confirmed"
             return now, LandingStep(
                 request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=False, text=text

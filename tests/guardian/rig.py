@@ -196,7 +196,6 @@ class Rig:
         lifting: bool = True,
         pilot: bool = False,
         goodbye: bool = False,
-        left_armed: bool = False,
         mocap_refused: bool = False,
         pose_age_s: float = 0.0,
     ) -> None:
@@ -211,7 +210,6 @@ class Rig:
             lifting=lifting,
             pilot=pilot,
             goodbye=goodbye,
-            left_armed=left_armed,
             mocap_refused=mocap_refused,
             autopilot_system=1,
             own_system=OWN_IDS[0],

@@ -188,6 +188,20 @@ def test_a_pilot_stays_one_and_a_rejected_pose_is_not_passed_on(pair: Pair, wait
     ]
 
 
+def test_the_rotors_may_start_for_as_long_as_px4_takes_to_say_that_it_is_armed(pair: Pair, waiting: Outputs) -> None:
+    client, guardian = pair
+    guard, lifting = HeartbeatSender(client, LINK, 0.0), []
+    requests = {0.0: AutopilotRequest.ARM}
+    for after_s in (0.0, 0.005, 1.4, 1.6):
+        request_ = requests.get(after_s, AutopilotRequest.DISARM)
+        seen = msgspec.structs.replace(inputs(), t_s=5.0 + after_s)
+        guard.tick(seen, msgspec.structs.replace(waiting, request=request_))
+        beat = heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES))
+        assert beat is not None
+        lifting.append(beat.lifting)
+    assert lifting == [True, True, True, False]
+
+
 def test_while_px4_may_be_armed_the_guardian_is_left_with_it_at_the_end(pair: Pair, waiting: Outputs) -> None:
     """Whatever the outcome, the guardian must stop turning rotors."""
     client, guardian = pair
@@ -196,9 +210,10 @@ def test_while_px4_may_be_armed_the_guardian_is_left_with_it_at_the_end(pair: Pa
     guard.goodbye(inputs(armed=True).status)
     guard.goodbye(inputs(armed=False).status, lost=True)
     guard.goodbye(inputs(armed=False).status)
-    beats = [heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) for _ in range(4)]
-    assert [beat is not None and (beat.goodbye, beat.left_armed) for beat in beats] == [
-        (False, False), (False, True), (False, True), (True, False)
+    guard.goodbye(inputs(armed=True).status)
+    beats = [heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) for _ in range(5)]
+    assert [beat is not None and (beat.goodbye, beat.lifting) for beat in beats] == [
+        (False, True), (True, True), (True, True), (True, False), (True, True)
     ]  # fmt: skip
 
 

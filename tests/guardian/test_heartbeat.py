@@ -25,7 +25,6 @@ beats = st.builds(
     lifting=st.booleans(),
     pilot=st.booleans(),
     goodbye=st.booleans(),
-    left_armed=st.booleans(),
     mocap_refused=st.booleans(),
     autopilot_system=byte,
     own_system=byte,

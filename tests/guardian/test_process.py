@@ -37,7 +37,7 @@ def test_it_imports_no_more_than_it_needs() -> None:
 def test_a_clean_end_of_the_flight_ends_it_quietly(tmp_path: Path) -> None:
     with Rig(tmp_path) as rig:
         rig.beat_until_ready()
-        rig.beat(goodbye=True)
+        rig.beat(goodbye=True, lifting=False)
         assert rig.guardian.wait(DEADLINE_S) == 0
         assert rig.flight.poll() is None, "it was not its business to end it"
         assert (rig.events, rig.result) == ([], None)
@@ -50,7 +50,7 @@ def test_ticks_that_it_did_not_hear_of_are_counted(tmp_path: Path) -> None:
         rig.beat_until_ready()
         rig.tick += 3
         rig.beat()
-        rig.beat(goodbye=True)
+        rig.beat(goodbye=True, lifting=False)
         assert rig.guardian.wait(DEADLINE_S) == 0
         assert rig.log.read_text().startswith(f"heard {rig.tick - 3} heartbeats, 3 missed, ")
 
@@ -121,7 +121,7 @@ def test_dead_or_hanging_in_the_air_it_takes_over_and_lands(tmp_path: Path, numb
 def test_a_flight_that_ends_with_px4_armed_is_taken_over_and_is_not_said_to_hang(tmp_path: Path) -> None:
     with Rig(tmp_path) as rig:
         rig.beat_until_ready()
-        rig.beat(left_armed=True)
+        rig.beat(goodbye=True)
         rig.land()
         assert rig.guardian.wait(DEADLINE_S) == 0, rig.log.read_text()
         assert sound(rig.events) == ["guardian_took_over", "guardian_land", "guardian_landed"]

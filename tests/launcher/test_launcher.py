@@ -233,6 +233,7 @@ def test_each_message_of_the_guardian_says_that_it_has_taken_over(message: Messa
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setblocking(False)
     guardian.channel, guardian.open, guardian.events, guardian.took_over = ours, True, [], False
+    guardian._clock = time.monotonic
     with ours, theirs:
         assert guardian.receive() == [] and not guardian.took_over
         assert ipc.send(theirs, message)

@@ -26,3 +26,12 @@ def test_a_message_arrives_and_one_that_cannot_says_so() -> None:
         assert isinstance(ipc.receive(ours), Unreadable)
         theirs.close()
         assert ipc.receive(ours) is None
+
+
+def test_what_was_said_before_the_end_is_heard_although_the_other_left_something_unread() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours:
+        with theirs:
+            assert ipc.send(ours, Land())
+            assert ipc.send(theirs, Px4Text("last"))
+        assert [ipc.receive(ours), ipc.receive(ours)] == [Px4Text("last"), None]

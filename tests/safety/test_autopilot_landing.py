@@ -232,6 +232,9 @@ def test_nothing_is_asked_against_a_pilot_for_as_long_as_they_fly() -> None:
         assert step.request is AutopilotRequest.NONE
         assert not step.zero_thrust
         assert not step.ended
+    silent = landing.step(seen(603.0, 1.0, mode=FlightMode.MANUAL, heard_s=600.0))
+    assert not silent.ended, "a gap of the link costs the pilot no motion capture"
+    assert landing.step(seen(600.0 + TIMEOUT_S, 1.0, mode=FlightMode.MANUAL, heard_s=600.0)).ended
     assert landing.step(seen(700.0, 0.3, mode=FlightMode.MANUAL, armed=False)).ended
 
 
