@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from companion.launcher import launcher
 from companion.launcher.launcher import Launcher
 from companion.launcher.reports import FlightReports
 from companion.model.exit_codes import EXIT_CODES
@@ -111,10 +110,9 @@ def test_a_flight_process_that_falls_silent_is_killed_when_its_time_is_over(
         kills.append(now_s[0])
         alive[0] = False
 
-    monkeypatch.setattr(launcher, "time", SimpleNamespace(monotonic=lambda: now_s[0]))
-    monkeypatch.setattr(
-        launcher.select, "select", lambda r, w, x, s: ([ours] if now_s[0] == 1.0 and said else [], [], [])
-    )
+    ready = SimpleNamespace(select=lambda r, w, x, s: ([ours] if now_s[0] == 1.0 and said else [], [], []))
+    monkeypatch.setattr("companion.launcher.launcher.time", SimpleNamespace(monotonic=lambda: now_s[0]))
+    monkeypatch.setattr("companion.launcher.launcher.select", ready)
     process: Any = SimpleNamespace(poll=lambda: None if alive[0] else 0, kill=kill)
     with ours, theirs:
         for message in said:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 from collections.abc import Callable, Iterator, Sequence
@@ -25,7 +26,7 @@ from companion.model.markers import Marker, MarkerFrame
 from companion.model.types import Inputs, OperatorCommand, Reference, Vec3, VehicleState
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate
-from companion.phases.intercept.meeting import BODY_S2, RISES_S, TILT_S2_M, Lag, meetings, reach_of
+from companion.phases.intercept.meeting import APART_S, BODY_S2, RISES_S, TILT_S2_M, TRIED_MAX, Lag, meetings, reach_of
 from companion.phases.intercept.motion import OVERSHOOT, Bounds, State
 from companion.phases.intercept.net import net_m, opening
 from companion.phases.intercept.phase import Intercept, Interception, Mode
@@ -244,14 +245,22 @@ def test_the_way_to_none_of_200_balls_and_the_stop_after_it_leave_a_limit() -> N
 class Tick(Air):
     """A tick of the phase that records what it reports."""
 
-    def __init__(self, t_s: float, frame: MarkerFrame | None, nominal: bool, reports: list[tuple[str, str]]) -> None:
+    def __init__(
+        self,
+        t_s: float,
+        frame: MarkerFrame | None,
+        nominal: bool,
+        reports: list[tuple[str, str]],
+        *,
+        holds: bool = False,
+    ) -> None:
         i = Inputs(tick=round(t_s * 200), t_s=t_s, command=OperatorCommand.NONE, recorder_dropped=0, markers=frame)
         o = Observation(
             inputs=i, airborne=True, armed_by_others=False, standing=None, reference=HOME, tether=None, thrust_share=1.0,
             pose_s=t_s, dt_s=TICK_PERIOD_S, force_world_n=None, disturbance_world_n=None, position_error_m=(0.0, 0.0, 0.0),
             yaw_error_rad=0.0,
         )  # fmt: skip
-        super().__init__(o, CONFIG.vehicle, MANIPULATOR, PHASES, SEGMENT, SEGMENT, LIMITS, SAFE, nominal)
+        super().__init__(o, CONFIG.vehicle, MANIPULATOR, PHASES, SEGMENT, SEGMENT, LIMITS, SAFE, nominal, holds)
         self._reports = reports
 
     def plan_reference(self) -> Reference:
@@ -268,20 +277,31 @@ class Flown:
     """What the phase did with some frames."""
 
     def __init__(
-        self, seen: Iterator[MarkerFrame], until_s: float, *, nominal: bool = True, hold_s: float = math.inf
+        self,
+        seen: Iterator[MarkerFrame],
+        until_s: float,
+        *,
+        nominal: bool = True,
+        hold_s: float = math.inf,
+        resume_s: float = math.inf,
+        warn_s: float = math.inf,
     ) -> None:
         self.reports: list[tuple[str, str]] = []
         self.states: list[Interception] = []
         self.references: list[Reference] = []
         waiting = {frame.frame_number + 1: frame for frame in seen}
         frame: MarkerFrame | None = None
+        was_held = False
         state: Any = PHASE.begin(Tick(0.0, None, nominal, self.reports))
         for number in range(1, round(until_s * 200.0)):
             frame = waiting.get(number, frame)
             t_s = number * TICK_PERIOD_S
-            if t_s >= hold_s:
-                state, hold_s = PHASE.leave(state, t_s), math.inf
-            state = None if state is None else PHASE.step(Tick(t_s, frame, nominal, self.reports), state)
+            holds = hold_s <= t_s < resume_s
+            if holds and not was_held:
+                state = PHASE.leave(state, t_s)
+            was_held = holds
+            tick = Tick(t_s, frame, nominal and t_s < warn_s, self.reports, holds=holds)
+            state = None if state is None else PHASE.step(tick, state)
             if state is None:
                 break
             self.states.append(state)
@@ -481,10 +501,99 @@ def test_above_nominal_nothing_is_chased() -> None:
     assert Flown(frames([MEETABLE], 0.6), 2.0, nominal=False).farthest_m == 0.0
 
 
-def test_a_hold_during_a_chase_brings_the_vehicle_to_rest_and_back() -> None:
-    flown = Flown(frames([MEETABLE], 0.6), 12.0, hold_s=0.35)
-    assert flown.over and 0.0 < flown.farthest_m < 0.2
-    assert math.dist(flown.references[-1].position_world_m, HOME.position_world_m) < 1e-3
+@pytest.mark.parametrize("hold_s", [0.35, 2.4], ids=["in-the-chase", "on-the-way-back"])
+def test_a_hold_brings_the_vehicle_to_rest_where_it_stays_until_it_is_resumed(hold_s: float) -> None:
+    free, flown = (
+        Flown(frames([MEETABLE], 0.6), 20.0, hold_s=at_s, resume_s=at_s + 6.0) for at_s in (math.inf, hold_s)
+    )
+    in_hold = flown.references[round((hold_s + 2.0) * 200) : round((hold_s + 6.0) * 200) - 2]
+    assert free.states[round(hold_s * 200)].mode is (Mode.CHASE if hold_s < 1.0 else Mode.RETURN)
+    assert {reference.position_world_m for reference in in_hold} == {in_hold[0].position_world_m}
+    assert math.dist(in_hold[0].position_world_m, HOME.position_world_m) > 0.01
+    assert flown.over and math.dist(flown.references[-1].position_world_m, HOME.position_world_m) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "until_s"),
+    [({}, 0.6), ({"hold_s": 0.4}, 0.6), ({"warn_s": 0.4}, 0.6), ({}, 0.35)],
+    ids=["met", "held", "warned", "no-frames-any-more"],
+)
+def test_the_reference_moves_on_when_a_chase_ends(options: dict[str, Any], until_s: float) -> None:
+    flown = Flown(frames([MEETABLE], until_s), 1.5, **options)
+    for before, after in itertools.pairwise(flown.references):
+        moved = np.subtract(after.position_world_m, before.position_world_m)
+        velocity = np.add(before.velocity_world_m_s, after.velocity_world_m_s) / 2
+        assert moved == pytest.approx(TICK_PERIOD_S * velocity, abs=5e-5)
+
+
+def test_a_chase_ends_when_no_frame_shows_its_ball_any_more() -> None:
+    flown = Flown(frames([MEETABLE], 0.3), 3.0)
+    chased_s = [TICK_PERIOD_S * k for k, state in enumerate(flown.states, 1) if state.mode is Mode.CHASE]
+    assert "ball_lost" in flown.ids and max(chased_s) < 0.3 + ball.BALL_COAST_S + 0.01
+
+
+def test_a_warning_ends_a_chase_and_says_why() -> None:
+    flown = Flown(frames([MEETABLE], 0.6), 3.0, warn_s=0.4)
+    assert flown.reports[-1] == ("ball_lost", "a rule has warned: no ball is met any more; stopping")
+
+
+def test_a_ball_that_comes_to_the_rotors_costs_few_looks_at_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks, asked = [0], Intercept._clearance_m
+
+    def counted(phase: Intercept, air: Air, s: Interception, path: list[ball.Point], plan: Any) -> float:
+        looks[0] += 1
+        asked(phase, air, s, path, plan)
+        return 0.0
+
+    monkeypatch.setattr(Intercept, "_clearance_m", counted)
+    worst = 0
+    state: Any = PHASE.begin(Tick(0.0, None, True, []))
+    for frame in frames([MEETABLE], 0.5):
+        looks[0] = 0
+        state = PHASE.step(Tick(frame.exposed_s + TICK_PERIOD_S, frame, True, []), state)
+        worst = max(worst, looks[0])
+    assert 1 < worst <= TRIED_MAX + 1
+
+
+def test_few_meetings_of_a_ball_are_tried_and_they_differ() -> None:
+    rest, counts = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), set()
+    for path, _, _ in throws(60, 6):
+        plans = list(meetings(0.0, rest, Lag(), path, NET_M, OPENING, BOUNDS, REACH, None))
+        times_s = sorted(plan.point.t_s for plan in plans)
+        assert all(b - a >= APART_S - 1e-9 for a, b in itertools.pairwise(times_s))
+        counts.add(len(plans))
+    assert max(counts) == TRIED_MAX
+
+
+def test_an_old_estimate_of_px4_is_moved_on_and_a_very_old_one_is_not_used() -> None:
+    rest = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    point = ball.Point(1.0, HOME.position_world_m, (0.0, 0.0, 0.0), 0.0)
+
+    def x_m(age_s: float) -> float:
+        moving = replace(
+            measured((0.1, 0.0, 0.0), 0.0, 0.0), velocity_world_m_s=(1.0, 0.0, 0.0), position_stamp_s=1.0 - age_s,
+            attitude_stamp_s=1.0 - age_s,
+        )  # fmt: skip
+        (place,) = places_body_m(moving, HOME.yaw_rad, 1.0, rest, Lag(), [point], lambda t_s: (0.0, 0.0, 0.0))
+        return -float(quat_rotate(quat_from_euler_zyx(0.0, 0.0, HOME.yaw_rad), place)[0])
+
+    assert [x_m(age_s) for age_s in (0.0, 0.05, 0.15)] == pytest.approx([0.1, 0.15, 0.0], abs=1e-9)
+
+
+def test_the_rotors_are_turned_as_the_body_was_measured() -> None:
+    rest = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    x, y, z = HOME.position_world_m
+    point = ball.Point(0.0, (x + 0.2, y, z), (0.0, 0.0, 0.0), 0.0)
+    turned = replace(
+        measured((0.0, 0.0, 0.0), 0.0, 0.0),
+        attitude_wxyz=quat_from_euler_zyx(0.0, 0.0, HOME.yaw_rad + math.radians(30.0)),
+    )
+    places = [
+        next(places_body_m(state, HOME.yaw_rad, 0.0, rest, Lag(), [point], lambda t_s: (0.0, 0.0, 0.0)))
+        for state in (None, turned)
+    ]
+    angles = [math.atan2(place[1], place[0]) for place in places]
+    assert angles[1] - angles[0] == pytest.approx(math.radians(-30.0))
 
 
 def test_the_same_inputs_give_the_same_states() -> None:

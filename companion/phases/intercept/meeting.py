@@ -43,8 +43,9 @@ KEPT: Final = 0.05
 """Effort by which another meeting must be better than the planned one."""
 STEP_S: Final = 0.02
 """Step of the sums over the time to a meeting."""
-TRIED_MAX: Final = 10
-"""Number of meetings that are tried, those of the least effort first, until the ball clears the rotors."""
+TRIED_MAX: Final = 4
+APART_S: Final = 0.05
+"""Number of meetings that are tried, those of the least effort first, until the ball clears the rotors, and the time between two."""
 
 
 class Lag(Record, frozen=True):
@@ -249,5 +250,10 @@ def meetings(
         kept = KEPT if kept_s is not None and abs(point.t_s - kept_s) < 1e-6 else 0.0
         found.append((needed + ASKEW * (1.0 - facing) - kept, point, (dx, dy, dz)))
     found.sort(key=operator.itemgetter(0))
-    for _, point, away_m in found[:TRIED_MAX]:
-        yield reach.plan(point, point.t_s - t_s, away_m, most, (nx, ny))
+    tried_s: list[float] = []
+    for _, point, away_m in found:
+        if all(abs(point.t_s - other_s) >= APART_S for other_s in tried_s):
+            tried_s.append(point.t_s)
+            yield reach.plan(point, point.t_s - t_s, away_m, most, (nx, ny))
+            if len(tried_s) == TRIED_MAX:
+                return

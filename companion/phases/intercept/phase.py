@@ -23,7 +23,7 @@ from companion.model.outputs import ChaseState
 from companion.model.types import Reference, SafetyAction, Severity, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate, Point
-from companion.phases.intercept.meeting import FROZEN_S, Lag, Plan, Reach, meetings, reach_of
+from companion.phases.intercept.meeting import FROZEN_S, RISES_S, Lag, Plan, Reach, meetings, reach_of
 from companion.phases.intercept.motion import Bounds, Motion, State, motion_to
 from companion.phases.intercept.net import beside_m, net_m, opening
 from companion.phases.intercept.rotors import clearance_m, places_body_m
@@ -32,8 +32,6 @@ from companion.safety.notices import EventDefinition
 
 ASTRAY_M: Final = 0.3
 """Distance from the planned meeting point beyond which a ball is another one."""
-STALE_S: Final = 0.3
-"""Time without a frame after which no ball is known any more."""
 HORIZON_S: Final = 1.5
 """Longest time for which a ball's path is predicted."""
 AMISS: Final = 0.5
@@ -177,7 +175,7 @@ class Intercept(Phase):
             s = replace(
                 s, candidates=ball.followed(s.candidates, frame, self.drag_per_m), frame_number=frame.frame_number
             )
-        elif s.candidates and air.t_s - s.candidates[0].t_s > STALE_S:
+        elif s.candidates and air.t_s - s.candidates[0].t_s > ball.BALL_COAST_S:
             s = replace(s, candidates=())
         if s.motion is not None:
             now = s.motion.at(air.t_s)
@@ -185,10 +183,14 @@ class Intercept(Phase):
         if s.mode is Mode.WAIT:
             return self._waited(air, s, new)
         if s.mode is Mode.CHASE:
-            return self._pushed(air, self._chased(air, s, new))
+            s = self._pushed(air, self._chased(air, s, new))
+            if s.mode is Mode.CHASE:
+                return s
         if s.motion is None:
-            return replace(s, motion=self._bounds(air, s).stop(air.t_s, s.now))
-        if s.mode is Mode.STOP and air.t_s >= s.motion.end_s + REST_S:
+            motion = self._bounds(air, s).stop(air.t_s - air.dt_s, s.now)
+            now = motion.at(air.t_s)
+            return replace(s, motion=motion, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
+        if s.mode is Mode.STOP and air.t_s >= s.motion.end_s + REST_S and not air.holds:
             away_m = math.dist(s.now.position_m, s.home.position_world_m)
             back_s = max(1.0, 1.875 * away_m / BACK_M_S)
             back = motion_to(air.t_s, s.now, back_s, s.home.position_world_m)
@@ -198,11 +200,11 @@ class Intercept(Phase):
         return s
 
     def leave(self, own: Any, t_s: float) -> Interception | None:
-        """Return the state that stops a chase; None while waiting."""
+        """Return the state that stops a chase or the way back; None while waiting."""
         s: Interception = own
         if s.mode is Mode.WAIT:
             return None
-        return replace(s, mode=Mode.STOP, motion=None) if s.mode is Mode.CHASE else s
+        return s if s.mode is Mode.STOP else replace(s, mode=Mode.STOP, motion=None)
 
     def reference(self, reference: Reference, own: Any) -> Reference:
         """Return the reference of the state."""
@@ -247,6 +249,7 @@ class Intercept(Phase):
             return s if s.passing_m is None else replace(s, passing_m=None, at_rotors=False)
         if not new or not air.nominal or not air.o.airborne:
             return s
+        net = self._net(air, s)
         for candidate in balls:
             path = self._path(air, s, candidate)
             if s.passing_m is None:
@@ -255,10 +258,13 @@ class Intercept(Phase):
             s = replace(
                 s,
                 seen=True,
-                passing_m=min([s.passing_m or math.inf, *[math.dist(p.position_m, self._net(air, s)) for p in path]]),
+                passing_m=min(
+                    math.inf if s.passing_m is None else s.passing_m,
+                    *[math.dist(at_m, net) for at_m in (candidate.position_m, *[point.position_m for point in path])],
+                ),
             )
             if (plan := self._meeting(air, s, path, None)) is not None:
-                left_s, away_m = plan.point.t_s - air.t_s, math.dist(plan.point.position_m, self._net(air, s))
+                left_s, away_m = plan.point.t_s - air.t_s, math.dist(plan.point.position_m, net)
                 air.report(MEETING_PLANNED, f"meets the ball in {left_s:.2f} s, {away_m:.2f} m from the waiting net")
                 return self._pushed(air, _planned(replace(s, mode=Mode.CHASE), plan, left_s))
             if not s.at_rotors and not self._clears(air, s, path, None):
@@ -271,18 +277,22 @@ class Intercept(Phase):
         assert s.plan is not None
         point = s.plan.point
         if air.t_s >= point.t_s:
-            return replace(s, mode=Mode.STOP, motion=self._bounds(air, s).stop(air.t_s, s.now))
-        if not new or point.t_s - air.t_s < FROZEN_S:
-            return s
+            return replace(s, mode=Mode.STOP)
+        if not air.nominal:
+            air.report(BALL_LOST, "a rule has warned: no ball is met any more; stopping")
+            return replace(s, mode=Mode.STOP)
         balls = [
             (math.dist(ball.predicted(c, point.t_s, self.drag_per_m).position_m, point.position_m), n)
             for n, c in enumerate(s.candidates)
             if c.is_ball
         ]
         at_m, number = min(balls, default=(math.inf, 0))
-        if at_m > ASTRAY_M or not air.nominal:
+        left_s = point.t_s - air.t_s
+        if not balls or (new and left_s >= FROZEN_S and at_m > ASTRAY_M):
             air.report(BALL_LOST, "the ball that was to be met is lost; stopping")
             return replace(s, mode=Mode.STOP)
+        if not new or left_s < FROZEN_S:
+            return s
         path = self._path(air, s, s.candidates[number])
         plan = self._meeting(air, s, path, point.t_s)
         if plan is not None:
@@ -300,13 +310,16 @@ class Intercept(Phase):
         bounds = self._bounds(air, s)
         now = bounds.pushed(air.t_s, s.now, air.dt_s, s.plan.push_m_s2(air.t_s, self._reach(air, s).drop_m))
         if now is None:
-            motion = bounds.stop(air.t_s - air.dt_s, s.now)
-            return replace(s, mode=Mode.STOP, motion=motion, now=motion.at(air.t_s))
+            return replace(s, mode=Mode.STOP)
         return replace(s, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
 
     def _path(self, air: Air, s: Interception, candidate: Candidate) -> list[Point]:
         floor_m = self._net(air, s)[2] - self.box_m[2]
         return ball.path(candidate, air.t_s + HORIZON_S, floor_m, self.drag_per_m)
+
+    def _now_s(self, air: Air, s: Interception) -> float:
+        """Return the time of the reference's motion: in a chase it is that of the last tick until this one has pushed it."""
+        return air.t_s - air.dt_s if s.mode is Mode.CHASE else air.t_s
 
     def _net(self, air: Air, s: Interception) -> Vec3:
         """Return the waiting net's centre, world frame."""
@@ -329,10 +342,18 @@ class Intercept(Phase):
         if tip is not None and s.mode is Mode.CHASE:
             bx += AMISS * (tip[0] - px - x - bx - u)
             by += AMISS * (tip[1] - py - y - by - v)
-            bz += AMISS * (tip[2] - pz - z - bz - w)
+            bz += AMISS * (tip[2] - pz - z - bz - w + RISES_S * s.now.velocity_m_s[2])
         net, bounds = (x + bx, y + by, z + bz), self._bounds(air, s)
         plans = meetings(
-            air.t_s, s.now, s.lag, path, net, opening(air.manipulator, s.home), bounds, self._reach(air, s), kept_s
+            self._now_s(air, s),
+            s.now,
+            s.lag,
+            path,
+            net,
+            opening(air.manipulator, s.home),
+            bounds,
+            self._reach(air, s),
+            kept_s,
         )
         return next((plan for plan in plans if self._clears(air, s, path, plan)), None)
 
@@ -343,11 +364,11 @@ class Intercept(Phase):
     def _clearance_m(self, air: Air, s: Interception, path: list[Point], plan: Plan | None) -> float:
         """Return the smallest distance of a ball from the rotors before it is met; without a plan, if the vehicle stops."""
         if plan is None:
-            push = partial(_acceleration_m_s2, self._bounds(air, s).stop(air.t_s, s.now))
+            push = partial(_acceleration_m_s2, self._bounds(air, s).stop(self._now_s(air, s), s.now))
         else:
             push = partial(plan.push_m_s2, drop_m=self._reach(air, s).drop_m)
             path = [point for point in path if point.t_s <= plan.point.t_s]
-        places = places_body_m(air.i.vehicle, s.home.yaw_rad, air.t_s, s.now, s.lag, path, push)
+        places = places_body_m(air.i.vehicle, s.home.yaw_rad, self._now_s(air, s), s.now, s.lag, path, push)
         return clearance_m(air.vehicle.airframe, places)
 
 

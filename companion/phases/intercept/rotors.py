@@ -12,7 +12,7 @@ from typing import Final
 
 from companion.config.airframe import Airframe
 from companion.model.constants import GRAVITY_M_S2
-from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.frames import quat_from_euler_zyx, quat_rotate, yaw_from_quat
 from companion.model.types import Vec3, VehicleState
 from companion.phases.intercept.ball import Point
 from companion.phases.intercept.meeting import Lag
@@ -20,6 +20,10 @@ from companion.phases.intercept.motion import State
 
 FAR_M: Final = 0.3
 """Distance from all rotors beyond which a ball passes them."""
+FRESH_S: Final = 0.1
+"""Age up to which PX4's estimate, moved on with its velocity, is used."""
+UPRIGHT: Final = 0.3
+"""Cosine of the tilt beyond which it is no attitude of a flight."""
 SHARES = (0.0, 0.33, 0.67)
 """Places between two points of a path at which the distance is taken."""
 
@@ -31,14 +35,14 @@ def clearance_m(airframe: Airframe, places_body_m: Iterable[Vec3]) -> float:
         airframe: rotors.
         places_body_m: successive places of the ball, body frame.
     """
-    least_m, disk_m = FAR_M, airframe.disk_radius_m
-    reach_m = airframe.radius_m + airframe.rotor_layout.height_m + FAR_M
+    layout, least_m, disk_m = airframe.rotor_layout, FAR_M, airframe.disk_radius_m
+    rotors, reach_m = layout.positions_body_m, airframe.radius_m + layout.height_m + FAR_M
     for (x, y, z), (to_x, to_y, to_z) in pairwise(places_body_m):
         if math.hypot(x, y, z) > reach_m:
             continue
         for share in SHARES:
             ball_x, ball_y, ball_z = x + share * (to_x - x), y + share * (to_y - y), z + share * (to_z - z)
-            for rotor_x, rotor_y, rotor_z in airframe.rotor_layout.positions_body_m:
+            for rotor_x, rotor_y, rotor_z in rotors:
                 beside_m = math.hypot(ball_x - rotor_x, ball_y - rotor_y) - disk_m
                 least_m = min(least_m, max(beside_m, abs(ball_z - rotor_z)))
     return least_m
@@ -56,7 +60,7 @@ def places_body_m(
     """Yield the places of a ball in the frame of the body that follows the reference.
 
     Args:
-        measured: PX4's estimate; None if it is unknown, and the body is then where the model says.
+        measured: PX4's estimate; None if it is unknown. If it is unknown or old, the body is where the model says.
         yaw_rad: yaw of the reference.
         t_s: flight clock.
         now: motion of the reference now.
@@ -64,12 +68,17 @@ def places_body_m(
         path: the ball's predicted path.
         push_m_s2: acceleration of the reference at a time on the flight clock.
     """
-    unyawed, p, v, a = quat_from_euler_zyx(0.0, 0.0, -yaw_rad), now.position_m, now.velocity_m_s, now.acceleration_m_s2
+    p, v, a = now.position_m, now.velocity_m_s, now.acceleration_m_s2
     (x, y, z), (slope_x, slope_y) = _body_m(p, lag), _slopes(lag, a)
     beside, lean_x, lean_y = (0.0, 0.0, 0.0), 0.0, 0.0
-    if measured is not None:
+    if measured is not None and t_s - min(measured.position_stamp_s, measured.attitude_stamp_s) <= FRESH_S:
+        age_s, (u, w, r) = t_s - measured.position_stamp_s, measured.velocity_world_m_s
         (mx, my, mz), (nx, ny, nz) = measured.position_world_m, quat_rotate(measured.attitude_wxyz, (0.0, 0.0, 1.0))
-        beside, lean_x, lean_y = (mx - x, my - y, mz - z), nx / nz - slope_x, ny / nz - slope_y
+        beside = (mx + age_s * u - x, my + age_s * w - y, mz + age_s * r - z)
+        if nz > UPRIGHT:
+            lean_x, lean_y = nx / nz - slope_x, ny / nz - slope_y
+            yaw_rad = yaw_from_quat(measured.attitude_wxyz)
+    unyawed = quat_from_euler_zyx(0.0, 0.0, -yaw_rad)
     for point in path:
         if (h := point.t_s - t_s) > 0.0:
             a = push_m_s2(point.t_s)
