@@ -149,7 +149,8 @@ class Px4Stub:
             return self._stopped
         self._estimator.predict(imu)
         if imu.baro_m is not None and self.params.integer("EKF2_BARO_CTRL"):
-            self._estimator.fuse_barometer(imu.baro_m)
+            descends = self.armed and self.nav_state in (NavState.LAND, NavState.DESCEND)
+            self._estimator.fuse_barometer(imu.baro_m, descends)
         self.estimate = estimate = self._estimator.estimate()
         queue = self._queue
         while queue and queue[0][0] <= t_s + _TIME_EPSILON_S:

@@ -34,10 +34,9 @@ _L_BIAS: Final = 1.0
 _L_YAW: Final = 0.3
 _BARO_BIAS_S: Final = 6.0
 """Time constant with which EKF2 follows the barometer's offset from vision (baro_bias_nsd 0.13, EKF2_BARO_NOISE 3.5)."""
-_L_BARO_POSITION: Final = 0.05
-_L_BARO_VELOCITY: Final = 0.005
-"""Gains of the barometer per second when it is the only height. Measured on 1.18 with EKF2_BARO_NOISE 3.5: in the first seconds without
-vision an error of 1 m moves the height by 0.1 m in 3 s.
+_L_BARO = ((1.0, 0.001, 0.0016), (4.0, 0.05, 0.02), (10.0, 0.30, 0.05))
+"""Time without vision, and the barometer's gains on position and velocity per second: those of EKF2's filter with EKF2_BARO_NOISE 3.5,
+whose covariance grows from what vision left.
 """
 _BIAS_MAX_M_S2: Final = 0.4
 """Limit of the accelerometer bias (EKF2_ABL_LIM)."""
@@ -164,9 +163,13 @@ class Estimator:
         self._rotate_world(ka / GRAVITY_M_S2 * ry, -ka / GRAVITY_M_S2 * rx, _L_YAW * dt * yaw_error)
         self._bias_z = max(-_BIAS_MAX_M_S2, min(_BIAS_MAX_M_S2, self._bias_z - _L_BIAS * dt * rz))
 
-    def fuse_barometer(self, height_m: float) -> None:
+    def fuse_barometer(self, height_m: float, descends: bool = False) -> None:
         """Fuse a barometric height above the floor. While vision is fused the barometer's weight is negligible; then only its offset
         is followed, which the position keeps when vision has ended.
+
+        Args:
+            descends: PX4 lands: a barometer that shows less than the estimate is not believed, because of the ground effect
+                (EKF2_GND_EFF_DZ).
         """
         if self._t_s is None:
             return
@@ -179,9 +182,13 @@ class Estimator:
             self._baro_bias_m += dt / _BARO_BIAS_S * (apart_m - self._baro_bias_m)
             return
         down_m = self._baro_bias_m - apart_m
+        if descends:
+            down_m = min(0.0, down_m)
+        since_s = self._t_s - self._fused_t_s if self._fused_t_s is not None else math.inf
+        k_p, k_v = _baro_gains(since_s)
         (px, py, pz), (vx, vy, vz) = self._p, self._v
-        self._p = (px, py, pz + dt * _L_BARO_POSITION * down_m)
-        self._v = (vx, vy, vz + dt * _L_BARO_VELOCITY * down_m)
+        self._p = (px, py, pz + dt * k_p * down_m)
+        self._v = (vx, vy, vz + dt * k_v * down_m)
 
     def _judge(self, gap_s: float, horizontal2: float, vertical2: float, noise2: float) -> None:
         gate2 = _TEST_GATE**2 * max(noise2 + self._variance_m2, 1e-12)
@@ -218,6 +225,9 @@ class Estimator:
             return Fusion(math.nan, math.nan, _FAKE_POSITION_SIGMA_M, _FAKE_POSITION_SIGMA_M)
         sigma_m = math.sqrt(self._variance_m2 + _growth_m2(since_s))
         h, v = (math.sqrt(value) for value in self._test) if since_s <= VISION_FUSED_TIMEOUT_S else (math.nan, math.nan)
+        if self._baro_t_s is not None:
+            # The mean over vision and the barometer, whose own is nearly 0.
+            v = 0.0 if math.isnan(v) else 0.5 * v
         return Fusion(h, v, sigma_m, sigma_m)
 
     def estimate(self) -> Estimate:
@@ -235,7 +245,17 @@ class Estimator:
             position_valid=since <= POSITION_VALID_TIMEOUT_S,
             height_valid=since <= POSITION_VALID_TIMEOUT_S or self._baro_t_s is not None,
             attitude_valid=self._tilt_aligned,
+            height_aided=since <= VISION_FUSED_TIMEOUT_S or self._baro_t_s is not None,
         )
+
+
+def _baro_gains(since_s: float) -> tuple[float, float]:
+    """Return the barometer's gains on position and velocity per second after a time without vision."""
+    begin_s, k_p, k_v = _L_BARO[0]
+    for end_s, to_p, to_v in _L_BARO[1:]:
+        share = max(0.0, min(1.0, (since_s - begin_s) / (end_s - begin_s)))
+        begin_s, k_p, k_v = end_s, k_p + share * (to_p - k_p), k_v + share * (to_v - k_v)
+    return k_p, k_v
 
 
 def _growth_m2(since_s: float) -> float:

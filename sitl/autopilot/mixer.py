@@ -36,7 +36,8 @@ class Mixer:
     def mix(self, torque: Vec3, thrust: float) -> RotorCommands:
         """Return rotor commands, 0 to 1.
 
-        On saturation, yaw is reduced first, then the collective thrust, and roll and pitch last.
+        If the largest command is too large, yaw is reduced first, then the collective thrust, and roll and pitch last. The thrust is
+        never raised for a torque (MC_AIRMODE 0): near zero thrust, roll and pitch are reduced.
         """
         roll, pitch, yaw = torque
         rows = self._rows
@@ -45,10 +46,14 @@ class Mixer:
         span = (most - least) / self._most
         if span > 1.0:
             tilt, least, most = [value / span for value in tilt], least / span, most / span
-        base = max(-least, min(self._most - most, thrust)) if thrust > 0.0 else 0.0
+        base = max(0.0, min(self._most - most, thrust))
+        reduced = base + least < 0.0
+        if reduced:
+            share = -base / least
+            tilt, least, most = [share * value for value in tilt], share * least, share * most
         room = min(base + least, self._most - base - most) * self._turn_room
         turn = max(-room, min(room, yaw)) if room > 0 else 0.0
-        self.unsaturated = span <= 1.0 and abs(base - thrust) < 0.05
+        self.unsaturated = span <= 1.0 and not reduced and abs(base - thrust) < 0.05
         commands = []
         for i, (t, _, _, y) in enumerate(rows):
             command = t * (base + tilt[i] + y * turn)

@@ -191,8 +191,10 @@ def estimator_status(stub: Px4Stub) -> Message | None:
     if estimate.position_valid:
         flags |= mavlink.ESTIMATOR_VELOCITY_HORIZ | mavlink.ESTIMATOR_POS_HORIZ_REL
         flags |= mavlink.ESTIMATOR_POS_HORIZ_ABS if stub.origin is not None else 0
+    if estimate.height_aided:
+        flags |= mavlink.ESTIMATOR_POS_VERT_ABS
     if estimate.vision_fused:
-        flags |= mavlink.ESTIMATOR_POS_VERT_ABS | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
+        flags |= mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
     if not estimate.vision_fused or (stub.landed and not stub.armed):
         flags |= mavlink.ESTIMATOR_CONST_POS_MODE
     fusion = stub.fusion

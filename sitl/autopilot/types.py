@@ -45,6 +45,8 @@ class Estimate(NamedTuple):
     height_valid: bool
     """z_valid: as long, and longer with a barometer."""
     attitude_valid: bool
+    height_aided: bool
+    """Whether a measurement supports the height: vision or the barometer."""
 
 
 class Fusion(NamedTuple):

@@ -103,6 +103,7 @@ def test_px4_whose_link_is_dead_finds_the_floor_by_its_barometer(barometer: int,
     config = load_sitl(
         "configs/missions/catch.yaml",
         overrides=[
+            "world.seed=2",
             "world.faults=[{kind: link_loss, phase: takeoff}]",
             f"world.px4_params={{EKF2_BARO_CTRL: {barometer}}}",
         ],

@@ -95,6 +95,16 @@ def test_saturation_shrinks_the_torques_of_any_layout_but_keeps_their_direction(
             assert yaw * sum(spin * k for spin, k in zip(layout.spins, commands, strict=True)) > -1e-6
 
 
+@pytest.mark.parametrize("thrust", [0.0, 0.05])
+def test_the_thrust_is_never_raised_for_a_torque(thrust: float) -> None:
+    """MC_AIRMODE 0: zero thrust stops the rotors whatever the rates are."""
+    layout = with_airframe(rotors=SPREAD).airframe.rotor_layout
+    mixer = Mixer(layout)
+    level, turned = mixer.mix((0.0, 0.0, 0.0), thrust), mixer.mix((0.2, -0.1, 0.1), thrust)
+    assert sum(turned) <= sum(level) + 1e-9
+    assert (max(turned) > max(level)) == (thrust > 0.0)
+
+
 WEAK = [
     "world.faults=[{kind: motor_weak, t_s: 1.0, size: 0.2}]",
     *(f"{key}={value}" for key, value in LOW_HOVER.items()),

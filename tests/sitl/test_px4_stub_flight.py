@@ -8,8 +8,10 @@ from functools import cache
 import pytest
 
 from sitl.autopilot.commander import Command, Result
+from sitl.autopilot.land_detector import LandDetector
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.origin import Origin
+from sitl.autopilot.params import Params
 from sitl.autopilot.setpoints import PositionTarget, RateTarget
 from sitl.autopilot.types import AttitudeTarget
 from tests.sitl.px4_rig import Rig
@@ -102,3 +104,18 @@ def test_with_a_barometer_that_is_a_metre_off_it_finds_the_floor_after_the_posit
     run_until(rig, lambda: rig.stub.landed, 6.0)
     run_until(rig, lambda: not rig.stub.armed, 2.5)
     assert rig.height_m == 0.0
+
+
+@pytest.mark.parametrize(("highest_m", "touches"), [(0.7, False), (1.4, True)], ids=["low-flight", "high-flight"])
+def test_thrust_counts_as_low_below_30_percent_and_below_60_once_the_hover_thrust_is_estimated(
+    highest_m: float, touches: bool
+) -> None:
+    """PX4 1.18 estimates the hover thrust only after it was a metre above the ground."""
+    detector = LandDetector(Params({"MPC_THR_MIN": 0.1, "MPC_THR_HOVER": 0.5}))
+    estimate = ready().stub.estimate
+    assert estimate is not None
+    for k in range(1000):
+        height_m = highest_m if 100 < k < 400 else 0.0
+        up = estimate._replace(position_ned_m=(0.0, 0.0, -height_m), velocity_ned_m_s=(0.0, 0.0, 0.0))
+        detector.update(0.01 * k, k > 50, up, 0.5 if k < 400 else 0.28, True, 0.7)
+    assert detector.ground_contact == touches
