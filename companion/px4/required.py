@@ -277,6 +277,9 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             file=False,
         ),
         Wanted(
+            "MC_AIRMODE", 0, "with airmode, the rotors of a standing vehicle turn at zero thrust, and it may tip over"
+        ),
+        Wanted(
             "MC_BAT_SCALE_EN",
             0,
             "if 1, PX4 scales every thrust by the battery's voltage, while the companion corrects the same sag by its estimate of the "
@@ -286,7 +289,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "COM_SPOOLUP_TIME",
             1.0,
-            "time after arming for which PX4 limits the thrust, s, while the companion spools up",
+            "time after arming for which PX4 limits the thrust of its own modes, s; the companion spools up meanwhile",
             limits=(0.0, SPOOL_S),
         ),
         Wanted(

@@ -51,6 +51,7 @@ SPOILED = [
     ("CA_ROTOR_COUNT", 6, True, "select the machine's airframe in QGroundControl"),
     ("BAT_CRIT_THR", 0.25, False, "set BAT_CRIT_THR to 0.1"),
     ("MC_BAT_SCALE_EN", 1, False, "set MC_BAT_SCALE_EN to 0"),
+    ("MC_AIRMODE", 1, True, "set MC_AIRMODE to 0"),
 ]
 
 
