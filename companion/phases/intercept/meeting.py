@@ -43,7 +43,7 @@ KEPT: Final = 0.05
 """Effort by which another meeting must be better than the planned one."""
 STEP_S: Final = 0.02
 """Step of the sums over the time to a meeting."""
-TRIED_MAX: Final = 4
+TRIED_MAX: Final = 3
 APART_S: Final = 0.05
 """Number of meetings that are tried, those of the least effort first, until the ball clears the rotors, and the time between two."""
 

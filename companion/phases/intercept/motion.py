@@ -12,6 +12,7 @@ coefficients, so a motion whose few coefficients respect the limits respects the
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Final
 
 from companion.config.mission import Limits
@@ -179,12 +180,23 @@ class Bounds:
         speed_m_s = math.hypot(*now.velocity_m_s) or 1.0
         tried = [scaled(push_m_s2, share) for share in EASED] + [scaled(now.velocity_m_s, -BRAKE_M_S2 / speed_m_s)]
         for push in tried:
-            after = self._after(now, dt_s, self._within(push))
+            after = self._after(now, dt_s, self.within(push))
             if self.admit(self.stop(t_s, after)):
                 return after
         return None
 
-    def _within(self, a: Vec3) -> Vec3:
+    def pushes(
+        self, t_s: float, now: State, push_m_s2: Callable[[float], Vec3], step_s: float, count: int
+    ) -> list[Vec3]:
+        """Return the accelerations that the limits leave of the wanted ones, in steps from now on."""
+        found = []
+        for k in range(count):
+            after = self.pushed(t_s + k * step_s, now, step_s, push_m_s2(t_s + (k + 0.5) * step_s))
+            now = self.stop(t_s, now).at(t_s + step_s) if after is None else after
+            found.append(now.acceleration_m_s2)
+        return found
+
+    def within(self, a: Vec3) -> Vec3:
         """Return the acceleration within the limits of size and tilt."""
         a = scaled(a, min(1.0, self.acceleration_m_s2 / max(1e-9, math.hypot(*a))))
         aside = min(1.0, 0.999 * self._slope * (a[2] + GRAVITY_M_S2) / max(1e-9, math.hypot(a[0], a[1])))
