@@ -6,6 +6,7 @@ import math
 from typing import Final
 
 from companion.core.flight_state import FlightState
+from companion.core.reactions import land_now
 from companion.core.transition import Transition
 from companion.model.best_pose import best_pose
 from companion.model.flight_stage import Stage
@@ -19,11 +20,15 @@ _NOWHERE: Vec3 = (0.0, 0.0, 0.0)
 
 
 def let_go_if_better(t: Transition) -> None:
-    """Open the clamp that holds the bar if that is better than to keep it."""
+    """Open the clamp that holds the bar if that is better than to keep it. A mission that loses its bar this way ends: its phase would
+    close the clamp again.
+    """
     why = _why(t)
     if why is not None:
         t.report(notices.BAR_LET_GO, f"the bar is let go: {why}")
         t.change(clamp=ClampCommand.OPEN, grip=Grip.FREE, bar=None)
+        if t.state.stage is Stage.MISSION and not t.state.aborting:
+            land_now(t)
 
 
 def _why(t: Transition) -> str | None:

@@ -9,11 +9,15 @@ from msgspec.structs import replace
 
 from companion.core.flight_state import FlightState
 from companion.core.let_go import let_go_if_better, team_state_of
+from companion.core.state_machine import transition
 from companion.core.transition import Parameters, Transition
+from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.air import HeldBar, Observation
+from companion.mission.plan import Plan
 from companion.model.flight_stage import Stage
 from companion.model.team import ClampCommand, Grip, PartnerState, TeamState
-from companion.model.types import ArmState, Inputs, SafetyAction
+from companion.model.types import ArmState, Inputs, Outcome, Reference, SafetyAction
+from companion.phases.carry.carry import Carrying
 from companion.safety.supervisor import SupervisorState
 from companion.sitl_config.team import load_team
 from tests.safety.healthy import ZERO3, healthy
@@ -49,6 +53,24 @@ def said(**fields: Any) -> PartnerState:
     return PartnerState(stamp_s=T_S - 0.01, said=replace(nominal, **fields))
 
 
+def observed(i: Inputs, force_n: float, reference: Reference | None = None) -> Observation:
+    return Observation(
+        inputs=i,
+        airborne=True,
+        armed_by_others=False,
+        standing=None,
+        reference=reference,
+        tether=None,
+        thrust_share=1.0,
+        pose_s=i.t_s,
+        dt_s=0.005,
+        force_world_n=(0.0, 0.0, -force_n),
+        disturbance_world_n=None,
+        position_error_m=ZERO3,
+        yaw_error_rad=0.0,
+    )
+
+
 def after(
     held: FlightState,
     height_m: float = 1.3,
@@ -57,22 +79,7 @@ def after(
     texts: list[str] | None = None,
 ) -> FlightState:
     """The state after a tick; the texts of its events are added to `texts`."""
-    observation = Observation(
-        inputs=inputs(height_m, partner),
-        airborne=True,
-        armed_by_others=False,
-        standing=None,
-        reference=None,
-        tether=None,
-        thrust_share=1.0,
-        pose_s=T_S,
-        dt_s=0.005,
-        force_world_n=(0.0, 0.0, -force_n),
-        disturbance_world_n=None,
-        position_error_m=ZERO3,
-        yaw_error_rad=0.0,
-    )
-    t = Transition(PARAMETERS, held, (), observation)
+    t = Transition(PARAMETERS, held, (), observed(inputs(height_m, partner), force_n))
     let_go_if_better(t)
     if texts is not None:
         texts += [event.text for event in t.events]
@@ -94,6 +101,25 @@ def test_a_bar_that_is_carried_is_kept_at_any_height() -> None:
 def test_a_bar_that_pulls_too_hard_is_let_go_at_any_height(stage: Stage) -> None:
     assert not let_go(after(state(stage=stage), 1.3, said(), force_n=17.0))
     assert let_go(after(state(stage=stage), 1.3, said(), force_n=19.0))
+
+
+def test_a_bar_that_is_let_go_in_the_mission_stays_let_go_and_the_vehicle_lands() -> None:
+    """Over more than one tick: the phase would command the clamp to close again."""
+    plan = Plan.build(CONFIG.mission, CONFIG.vehicle)
+    carry = plan.segments[2]
+    way_s = carry.start_s + 6.0
+    reference = plan.reference(way_s)
+    own = Carrying(bar=BAR, along_world=(0.0, -1.0, 0.0), pose=(0.0, 0.0, 1.0, 0.0), begun_s=0.0, begun_offset_m=ZERO3)
+    found = state(course=ActiveTrajectory(plan, T_S - way_s), own=own, engaged=carry, mission_start_s=0.0)
+    for force_n in (17.0, 19.0, 2.0, 2.0):
+        i = inputs(1.3, said())
+        found, _ = transition(PARAMETERS, found, (), observed(i, force_n, reference))
+        if force_n == 17.0:
+            assert not let_go(found)
+        else:
+            assert let_go(found)
+            assert (found.stage, found.aborting, found.supervisor.action) == (Stage.MISSION, True, SafetyAction.LAND)
+            assert found.outcome is Outcome.ABORTED
 
 
 def test_a_vehicle_that_falls_lets_go_at_once() -> None:
