@@ -44,7 +44,7 @@ def _why(t: Transition) -> str | None:
     by_px4 = state.stage is Stage.AUTOPILOT_LAND
     if not (state.aborting or by_px4 or state.stage not in _HERE):
         return None
-    if i.t_s >= state.opens_s:
+    if not by_px4 and i.t_s >= state.opens_s:  # the time is that of the companion's own descent
         return "it stands on the floor"
     if by_px4 or state.stage not in _HERE or _lands_otherwise(t, i.partner):
         height_m = _clamp_height_m(t)

@@ -18,6 +18,7 @@ from companion.model.flight_stage import Stage
 from companion.model.team import ClampCommand, Grip, PartnerState, TeamState
 from companion.model.types import ArmState, Inputs, Outcome, Reference, SafetyAction
 from companion.phases.carry.carry import Carrying
+from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.supervisor import SupervisorState
 from companion.sitl_config.team import load_team
 from tests.safety.healthy import ZERO3, healthy
@@ -149,6 +150,14 @@ def test_a_vehicle_that_px4_lands_lets_go_when_the_feet_are_low() -> None:
     assert let_go(after(landing, 0.93, said(), texts=texts))
     assert let_go(after(landing, 0.8, said(), texts=texts))
     assert texts == [f"the bar is let go: its feet are {height_m} m above the floor" for height_m in ("0.09", "0.00")]
+
+
+@pytest.mark.parametrize("pilot", [False, True])
+def test_the_time_of_a_landing_that_px4_or_a_pilot_has_taken_over_does_not_open_the_clamp(pilot: bool) -> None:
+    by_px4 = AutopilotLanding.begin(T_S, PARAMETERS.clearance_m, PARAMETERS.tilt_max_rad, pilot, pose_s=T_S)
+    landing = state(stage=Stage.AUTOPILOT_LAND, aborting=True, opens_s=T_S - 1.0, landing=by_px4)
+    assert not let_go(after(landing, 1.6, said(lands=True)))
+    assert let_go(after(landing, 0.93, said(lands=True)))
 
 
 @pytest.mark.parametrize(
