@@ -128,6 +128,17 @@ class VehicleControl:
         """Set the force sensor's bias from the collected samples."""
         self._sensing.finish_tare()
 
+    def force_on_tool_n(self, i: Inputs) -> Vec3 | None:
+        """Return the measured force on the tool, world frame, N, in a tick without the law; None if it is stale, or without a tare."""
+        if i.vehicle is None or i.arm is None:
+            return None
+        return self._external_n(i, i.vehicle, i.arm.angle_rad)
+
+    def _external_n(self, i: Inputs, vehicle: VehicleState, arm_rad: Joints) -> Vec3 | None:
+        if i.force is None or i.t_s - i.force.stamp_s > self._force_timeout_s:
+            return None
+        return self._sensing.external_world_n(i.force, vehicle.attitude_wxyz, arm_rad)
+
     def level(self, i: Inputs) -> AttitudeSetpoint | None:
         """Return a level attitude at the current yaw without thrust, or None if the attitude is not known."""
         if i.vehicle is None:
@@ -179,9 +190,7 @@ class VehicleControl:
         if arm is not None:
             arm_rad, arm_rate_rad_s = self._joints.now(i.t_s, arm)
         self._arm_target_rad = arm_rad
-        force = None
-        if i.force is not None and i.t_s - i.force.stamp_s <= self._force_timeout_s:
-            force = self._sensing.external_world_n(i.force, vehicle.attitude_wxyz, arm_rad)
+        force = self._external_n(i, vehicle, arm_rad)
         off_the_floor = vertical_scale >= 1.0 and off_the_ground(i, self._ground_clearance_m)
         pressing = self.press_direction
         airborne = off_the_floor and pressing is None

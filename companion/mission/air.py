@@ -87,7 +87,7 @@ class Observation(Record, frozen=True):
     dt_s: float
     """Time since the previous tick."""
     force_world_n: Vec3 | None
-    """Force on the tool in the last tick, world frame; None if the law did not run."""
+    """Force on the tool in the last tick, world frame; if the law did not run, the measured one, and None if there is none."""
     disturbance_world_n: Vec3 | None
     """Force on the vehicle that its motion shows, world frame; None on the ground, and if it is the force on the tool as well."""
     position_error_m: Vec3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +13,7 @@ from companion.config.loader import load_flight
 from companion.control.types import Tuning
 from companion.core.flight_core import FlightCore
 from companion.mission.air import Expectation
+from companion.model.flight_stage import Stage
 from companion.model.outputs import ChaseState, TetherState
 from companion.model.team import Grip
 from companion.model.types import OperatorCommand, PhaseKind, SafetyAction, Vec3
@@ -50,6 +52,23 @@ def test_before_the_first_control_tick_there_is_no_error_and_no_mission_time() -
     core._observe(replace(healthy(1), status=None), 0.005)
     assert core._context.waiting, "the rules judge nothing while inputs are missing"
     assert core.step(replace(healthy(1), status=None)).mission_t_s == 0.0
+
+
+def test_the_force_on_the_tool_is_known_while_px4_lands() -> None:
+    """The law, which measures it in flight, does not run then, and a bar that pulls too hard is to be let go all the same."""
+    core, i = core_in_flight(stage=Stage.AUTOPILOT_LAND), healthy()
+    assert core._observe(i, 0.005)[1].force_world_n is None, "without a tare"
+    core._control.begin_tare()
+    core._control.collect_tare(i)
+    core._control.finish_tare()
+    assert i.force is not None
+    x, y, z = i.force.force_sensor_n
+    pulls = replace(i, force=replace(i.force, force_sensor_n=(x + 12.0, y, z - 16.0)))
+    force = core._observe(pulls, 0.005)[1].force_world_n
+    assert force is not None and math.hypot(*force) == pytest.approx(20.0)
+    old_s = i.t_s - HOVERING.vehicle.safety.force_timeout_s - 0.01
+    stale = replace(pulls, force=replace(i.force, stamp_s=old_s))
+    assert core._observe(stale, 0.005)[1].force_world_n is None
 
 
 @pytest.mark.parametrize(
