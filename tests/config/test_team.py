@@ -56,8 +56,30 @@ def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
             "the tethers come as near as 0.",
         ),
         (["mission.phases[1].bar.length_m=0.6"], "the vehicles come as near as "),
+        (
+            ["vehicle.tether=null", "left.mission.start.position_m=[-1.0, -1.45]"],
+            "the ways of the vehicles to the bar come as near as 0.00 m",
+        ),
+        (
+            [
+                "vehicle.tether=null",
+                *("left.mission.start.position_m=[-1.0, -1.45]", "left.mission.start.yaw_deg=90"),
+                *("right.mission.start.position_m=[-1.0, 1.45]", "right.mission.start.yaw_deg=-90"),
+            ],
+            "the ways of the vehicles to the bar come as near as 0.00 m",
+        ),
     ],
-    ids=["one body", "one port", "one name", "other phases", "two servers", "tethers", "short bar"],
+    ids=[
+        "one body",
+        "one port",
+        "one name",
+        "phases",
+        "servers",
+        "tethers",
+        "short bar",
+        "one start",
+        "starts swapped",
+    ],
 )
 def test_members_that_do_not_go_together_are_refused_in_one_line(overrides: list[str], said: str) -> None:
     (line,) = problems(*overrides)

@@ -15,6 +15,8 @@ from companion.phases.carry.carry import Carry
 from companion.phases.carry.grip import APART_M
 
 STEP_S: Final = 0.05
+ROUNDING_M: Final = 1e-6
+"""Difference of two computed distances that are equal."""
 TETHERS_APART_M: Final = 0.3
 """Least distance between the straight lines of the two tethers."""
 
@@ -65,7 +67,15 @@ def _near(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
     crossed: tuple[float, float] | None = None
     begun = [next(s.start_s for s in plan.segments if s.index == index) for plan in plans]
     end_s = max(plan.duration_s - start_s for plan, start_s in zip(plans, begun, strict=True))
-    # Before the bar is lifted each is on its own side, at a time of its own; then both move at once.
+    # Before the bar is lifted each moves at a time of its own, so that no place of one way may be near any of the other.
+    ways = [_way(plan, start_s) for plan, start_s in zip(plans, begun, strict=True)]
+    ways_m = min(math.dist(one, other) for one in ways[0] for other in ways[1])
+    if ways_m < min(least_m, math.dist(ways[0][-1], ways[1][-1]) - ROUNDING_M):
+        yield (
+            f"the ways of the vehicles to the bar come as near as {ways_m:.2f} m (minimum {least_m:.2f} m: two rotor circles and "
+            f"{APART_M:g} m); start each at its own end of the bar (mission.start.position_m)"
+        )
+    # Then both move at once.
     for n in range(int(end_s / STEP_S)):
         at = [plan.reference(start_s + n * STEP_S) for plan, start_s in zip(plans, begun, strict=True)]
         apart_m = math.dist(at[0].position_world_m[:2], at[1].position_world_m[:2])
@@ -84,6 +94,12 @@ def _near(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
             f"the tethers come as near as {crossed[1]:.2f} m, {crossed[0]:.1f} s after the lift (minimum {TETHERS_APART_M:g} m): they "
             "may cross; move the anchors apart, or change the waypoints"
         )
+
+
+def _way(plan: Plan, end_s: float) -> list[tuple[float, float]]:
+    """Return the horizontal places of the vehicle until a time of its plan."""
+    times_s = [*(n * STEP_S for n in range(math.ceil(end_s / STEP_S))), end_s]
+    return [plan.reference(t_s).position_world_m[:2] for t_s in times_s]
 
 
 def _tethers_apart_m(left: Vehicle, at_left: Reference, right: Vehicle, at_right: Reference) -> float:
