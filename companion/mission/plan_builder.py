@@ -141,8 +141,11 @@ class PlanBuilder:
 
     def turn(self, to_yaw_rad: float, duration_s: float) -> None:
         """Append a turn to the given yaw in the shorter direction."""
-        yaw_rad = self._at[1][0]
-        self._go(1, (yaw_rad + wrap_rad(to_yaw_rad - yaw_rad),), self.t_s, duration_s, rest_to_rest)
+        self.turn_by(wrap_rad(to_yaw_rad - self.yaw_rad), duration_s)
+
+    def turn_by(self, angle_rad: float, duration_s: float) -> None:
+        """Append a turn by an angle, positive counterclockwise."""
+        self._go(1, (self.yaw_rad + angle_rad,), self.t_s, duration_s, rest_to_rest)
 
     def least_arm_s(self, to_rad: Joints, limits: ArmLimits) -> float:
         """Return the shortest time in which the arm can move to the given pose, s."""

@@ -25,17 +25,29 @@ def clamp_m(config: SitlConfig, r: Reference) -> Vec3:
     return plus(r.position_world_m, quat_rotate(quat_from_euler_zyx(0.0, 0.0, r.yaw_rad), tip))
 
 
-def both_plans() -> list[tuple[SitlConfig, Plan, float, float]]:
+def both_plans(*overrides: str) -> list[tuple[SitlConfig, Plan, float, float]]:
     found = []
-    for _, config in load_team("carry").members:
+    for _, config in load_team("carry", overrides).members:
         plan = Plan.build(config.mission, config.vehicle)
         carry = plan.segments[2]
         found.append((config, plan, carry.start_s, carry.end_s))
     return found
 
 
-def test_both_ends_of_the_bar_move_as_one_rigid_body() -> None:
-    (left, plan_l, begin_l, end_l), (right, plan_r, begin_r, end_r) = both_plans()
+def half_a_turn(from_deg: float) -> tuple[str, ...]:
+    """Overrides with which the bar turns to a yaw and then by 180 deg, where neither direction is the shorter one."""
+    waypoints = ",".join(f"{{position_m: [-0.6, 0.0], yaw_deg: {yaw}}}" for yaw in (from_deg, from_deg - 180.0))
+    room = "vehicle.room={x_m: [-4, 4], y_m: [-4, 4], z_m: [0, 2.2]}"
+    return "vehicle.tether=null", room, f"mission.phases[2].waypoints=[{waypoints}]"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "yaws_deg"),
+    [((), {90, 45}), (half_a_turn(135.0), {90, 135}), (half_a_turn(100.0), {90, 100}), (half_a_turn(50.0), {90, 50})],
+    ids=["shipped", "half a turn from 135 deg", "from 100 deg", "from 50 deg"],
+)
+def test_both_ends_of_the_bar_move_as_one_rigid_body(overrides: tuple[str, ...], yaws_deg: set[int]) -> None:
+    (left, plan_l, begin_l, end_l), (right, plan_r, begin_r, end_r) = both_plans(*overrides)
     assert end_l - begin_l == pytest.approx(end_r - begin_r)
     turned = set()
     for n in range(200):
@@ -46,7 +58,7 @@ def test_both_ends_of_the_bar_move_as_one_rigid_body() -> None:
         yaw_rad = math.atan2(one[1] - other[1], one[0] - other[0])
         assert math.cos(a.yaw_rad - yaw_rad - math.pi) == pytest.approx(1.0)
         turned.add(round(math.degrees(yaw_rad)))
-    assert {90, 45} <= turned
+    assert yaws_deg <= turned
 
 
 def test_velocity_and_acceleration_of_a_turning_end_are_those_of_its_path() -> None:

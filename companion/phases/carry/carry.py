@@ -162,7 +162,8 @@ class Carry(Phase):
                 count = max(4, math.ceil(abs(after.yaw_rad - before.yaw_rad) / PIECE_RAD))
                 knots_s = [duration_s * n / count for n in range(count + 1)]
                 p.builder.pieces(knots_s, [_turning(before, after, in_bar_m, t_s, duration_s) for t_s in knots_s])
-                p.builder.turn(vehicle_yaw_rad(after.yaw_rad, grip.end), duration_s)
+                # As the bar turns: a turn by 180 deg has no shorter direction.
+                p.builder.turn_by(after.yaw_rad - before.yaw_rad, duration_s)
             p.builder.t_s += duration_s
 
     def begin(self, air: Air) -> Carrying:
