@@ -217,7 +217,7 @@ RULES: tuple[Rule, ...] = (
     ),
 
     Rule(
-        id="partner_quiet", subject=Subject.PARTNER, what="nothing is heard from the other vehicle; this one holds no bar",
+        id="partner_quiet", subject=Subject.PARTNER, what="nothing is heard from the other vehicle; not both hold the bar yet",
         predicate=team.partner_quiet, thresholds=("partner_timeout_s",), ground=_WARN, air=_WARN,
         message="nothing from the other vehicle for more than {:.1f} s",
     ),

@@ -68,19 +68,25 @@ class TeamTracker:
                 self.bar_tilt_deg = math.degrees(math.asin(max(-1.0, min(1.0, abs(up)))))
 
 
+def _both_hold(t: TeamTracker) -> bool:
+    """Return whether both hold the bar, as far as is known."""
+    return t.grip in HELD and (t.said is None or t.said.grip in HELD)
+
+
 def partner_quiet(t: TeamTracker, timeout_s: float) -> Values | None:
-    """Fires if the other vehicle is silent while this one holds nothing."""
-    return (timeout_s,) if t.age_s > timeout_s and t.grip not in HELD and not t.done else None
+    """Fires if the other vehicle is silent while one of the two holds nothing yet."""
+    before = t.grip in (Grip.FREE, Grip.READY) and not _both_hold(t) and not t.done
+    return (timeout_s,) if before and t.age_s > timeout_s else None
 
 
 def partner_silent(t: TeamTracker, timeout_s: float) -> Values | None:
-    """Fires if the other vehicle is silent while this one holds its end of the bar."""
-    return (timeout_s,) if t.age_s > timeout_s and t.grip in HELD else None
+    """Fires if the other vehicle is silent while both hold the bar."""
+    return (timeout_s,) if t.age_s > timeout_s and _both_hold(t) else None
 
 
 def partner_late(t: TeamTracker, timeout_s: float) -> Values | None:
-    """Fires if what the other vehicle says was said long ago, as on a jammed network, while this one holds its end of the bar."""
-    return (t.late_s, timeout_s) if t.late_s > timeout_s and t.grip in HELD else None
+    """Fires if what the other vehicle says was said long ago, as on a jammed network, while both hold the bar."""
+    return (t.late_s, timeout_s) if t.late_s > timeout_s and _both_hold(t) else None
 
 
 def partner_holds(t: TeamTracker, _: None) -> Values | None:

@@ -1,0 +1,48 @@
+"""Which silence of the other vehicle matters: what each of the two has in its clamp decides."""
+
+from __future__ import annotations
+
+import pytest
+from msgspec.structs import replace
+
+from companion.model.team import Grip, PartnerState
+from companion.safety.flight_context import FlightContext
+from companion.safety.team import TeamTracker, partner_late, partner_quiet, partner_silent
+from tests.safety.healthy import healthy, with_partner
+
+TIMEOUT_S = 0.3
+
+
+def fired(own: tuple[Grip, ...], other: Grip | None) -> tuple[bool, bool, bool]:
+    """Whether the rules quiet, silent and late fire after the other vehicle, with `other` in its clamp, was last heard 1 s ago."""
+    tracker, heard = TeamTracker(), with_partner(healthy())
+    assert heard.partner is not None
+    old = replace(heard.partner.said, grip=other or Grip.FREE, server_s=8.0)
+    partner = None if other is None else PartnerState(stamp_s=heard.partner.stamp_s, said=old)
+    for n, grip in enumerate(own):
+        last = n == len(own) - 1
+        tracker.update(replace(heard, partner=partner), FlightContext(True, True, 0.0, grip=grip), 2.0 if last else 1.0)
+    rules = partner_quiet, partner_silent, partner_late
+    quiet, silent, late = (rule(tracker, TIMEOUT_S) is not None for rule in rules)
+    return quiet, silent, late
+
+
+@pytest.mark.parametrize("own", [Grip.READY, Grip.CARRYING, Grip.STANDING])
+@pytest.mark.parametrize("other", [Grip.READY, Grip.CARRYING, Grip.STANDING])
+def test_silence_and_late_words_matter_while_both_hold_the_bar(own: Grip, other: Grip) -> None:
+    assert fired((own, own), other) == (False, True, True)
+
+
+def test_a_partner_that_has_let_the_standing_bar_go_may_end_its_flight() -> None:
+    assert fired((Grip.STANDING, Grip.STANDING), Grip.FREE) == (False, False, False)
+    assert fired((Grip.STANDING, Grip.FREE), Grip.FREE) == (False, False, False)
+
+
+@pytest.mark.parametrize("own", [Grip.FREE, Grip.READY])
+def test_before_both_hold_the_bar_silence_is_a_warning(own: Grip) -> None:
+    assert fired((own, own), Grip.FREE) == (True, False, False)
+
+
+def test_a_partner_that_was_never_heard_is_silent() -> None:
+    assert fired((Grip.FREE, Grip.FREE), None) == (True, False, False)
+    assert fired((Grip.CARRYING, Grip.CARRYING), None) == (False, True, False)
