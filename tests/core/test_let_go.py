@@ -92,6 +92,28 @@ def let_go(found: FlightState) -> bool:
     return found.bar is None
 
 
+def on_the_way(**fields: Any) -> tuple[FlightState, Reference]:
+    """A state in the phase `carry`, and the last reference; `fields` of the phase's state have other values."""
+    plan = Plan.build(CONFIG.mission, CONFIG.vehicle)
+    carry = plan.segments[2]
+    way_s = carry.start_s + 6.0
+    own = Carrying(bar=BAR, along_world=(0.0, -1.0, 0.0), pose=(0.0, 0.0, 1.0, 0.0), begun_s=0.0, begun_offset_m=ZERO3)
+    course = ActiveTrajectory(plan, T_S - way_s)
+    return state(course=course, own=replace(own, **fields), engaged=carry, mission_start_s=0.0), plan.reference(way_s)
+
+
+@pytest.mark.parametrize("action", [SafetyAction.NOMINAL, SafetyAction.HOLD])
+def test_a_lifted_bar_that_is_not_felt_lands_the_vehicle_in_a_hold_too(action: SafetyAction) -> None:
+    """A bar that has slipped out of the other clamp tilts, and by that holds both."""
+    found, reference = on_the_way(bar=replace(BAR, weight_n=0.0), light_s=T_S - 1.1)
+    if action is SafetyAction.HOLD:
+        assert found.course is not None
+        found = replace(found, supervisor=SupervisorState(action, "bar_tilted", T_S), course=found.course.hold(T_S))
+    found, request = transition(PARAMETERS, found, (), observed(inputs(1.3, said()), 0.0, reference))
+    assert [event.id for event in request.events] == ["bar_lost"]
+    assert (found.aborting, found.supervisor.action) == (True, SafetyAction.LAND)
+
+
 def test_a_bar_that_is_carried_is_kept_at_any_height() -> None:
     for height_m in (0.85, 1.3):
         assert not let_go(after(state(), height_m, said()))
@@ -106,12 +128,7 @@ def test_a_bar_that_pulls_too_hard_is_let_go_at_any_height(stage: Stage) -> None
 
 def test_a_bar_that_is_let_go_in_the_mission_stays_let_go_and_the_vehicle_lands() -> None:
     """Over more than one tick: the phase would command the clamp to close again."""
-    plan = Plan.build(CONFIG.mission, CONFIG.vehicle)
-    carry = plan.segments[2]
-    way_s = carry.start_s + 6.0
-    reference = plan.reference(way_s)
-    own = Carrying(bar=BAR, along_world=(0.0, -1.0, 0.0), pose=(0.0, 0.0, 1.0, 0.0), begun_s=0.0, begun_offset_m=ZERO3)
-    found = state(course=ActiveTrajectory(plan, T_S - way_s), own=own, engaged=carry, mission_start_s=0.0)
+    found, reference = on_the_way()
     for force_n in (17.0, 19.0, 2.0, 2.0):
         i = inputs(1.3, said())
         found, _ = transition(PARAMETERS, found, (), observed(i, force_n, reference))

@@ -183,7 +183,7 @@ class Carry(Phase):
         s = self._yielding(air, replace(s, pose=pose, along_world=along, share=left))
         lifted = pose[2] > s.bar.stands_m + LIFTED_M
         s = replace(s, light_s=min(s.light_s, air.t_s) if lifted and s.bar.weight_n < WEIGHT_MIN_N else math.inf)
-        if air.t_s - s.light_s > LIGHT_S and not air.holds:
+        if air.t_s - s.light_s > LIGHT_S:
             air.report(
                 BAR_LOST, f"the bar weighs {max(0.0, s.bar.weight_n):.1f} N at this end (minimum {WEIGHT_MIN_N:g} N)"
             )
