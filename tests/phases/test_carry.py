@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from companion.config.loader import load_flight
 from companion.control.arm_model import manipulator_of
@@ -12,9 +15,12 @@ from companion.mission.check import check_mission
 from companion.mission.plan import Plan
 from companion.model.algebra import plus
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
+from companion.model.team import Grip
 from companion.model.types import Reference, Vec3
+from companion.phases.carry.grip import Gripping
 from companion.sitl_config.loader import SitlConfig
 from companion.sitl_config.team import load_team
+from tests.safety.healthy import healthy, with_partner
 
 LENGTH_M = 1.2
 STEP_S = 1e-4
@@ -73,6 +79,29 @@ def test_velocity_and_acceleration_of_a_turning_end_are_those_of_its_path() -> N
             )
             assert now.velocity_world_m_s[axis] == pytest.approx((p[2] - p[0]) / (2 * STEP_S), abs=1e-5)
             assert now.acceleration_world_m_s2[axis] == pytest.approx((v[1] - v[0]) / (2 * STEP_S), abs=1e-3)
+
+
+@pytest.mark.parametrize("end", ["left", "right"])
+def test_a_bar_that_the_other_one_has_lifted_is_followed_even_while_that_one_holds(end: str) -> None:
+    """A hold of this vehicle at the instant of the lift has cancelled its own, and stopped the other in the air."""
+    config: Any = getattr(load_team("carry"), end)
+    grip: Any = config.mission.phases[1]
+    i, partner = with_partner(healthy()), with_partner(healthy()).partner
+    assert partner is not None and i.mocap is not None
+
+    def lift_s(agreed_s: float | None = None, held_here: bool = False, **said: Any) -> float | None:
+        heard = replace(partner, said=replace(partner.said, **said))
+        air: Any = SimpleNamespace(i=replace(i, partner=heard), t_s=i.t_s, holds=held_here)
+        found: float | None = grip._lift_server_s(air, Gripping(closed_s=i.t_s - 1.0, lift_server_s=agreed_s))
+        return found
+
+    now_s = i.mocap.exposure_server_s
+    assert now_s is not None
+    for holds in (False, True):
+        assert lift_s(grip=Grip.CARRYING, holds=holds) == now_s
+        assert lift_s(grip=Grip.CARRYING, holds=holds, agreed_s=now_s + 0.1) == now_s + 0.1
+    assert lift_s(grip=Grip.READY, holds=True, agreed_s=now_s) is None, "it has lifted nothing"
+    assert lift_s(grip=Grip.CARRYING, holds=True, held_here=True) is None
 
 
 @pytest.mark.parametrize(

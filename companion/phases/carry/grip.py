@@ -261,11 +261,13 @@ class GripHandle(Phase):
         """Return when the bar is lifted, as the left member has set it; None while one of the two is not ready."""
         partner = air.i.partner
         fresh = partner is not None and air.t_s - partner.stamp_s <= PARTNER_FRESH_S
-        if partner is None or not fresh or air.holds or s.closed_s == math.inf or partner.said.holds:
+        if partner is None or not fresh or air.holds or s.closed_s == math.inf:
+            return None
+        if partner.said.grip is Grip.CARRYING:  # it holds in the air, if a hold here has cancelled the lift: follow it
+            return server_s(air.i) if s.lift_server_s is None else s.lift_server_s
+        if partner.said.holds:
             return None
         if self.end == "right":
-            if partner.said.grip is Grip.CARRYING and s.lift_server_s is None:
-                return server_s(air.i)
             return partner.said.together.go_server_s or s.lift_server_s
         now_s = server_s(air.i)
         if s.lift_server_s is None and partner.said.grip is Grip.READY and math.isfinite(now_s):
