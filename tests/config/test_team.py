@@ -49,7 +49,10 @@ def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
         ),
         (["right.vehicle.devices.team.port=14700"], "both members have devices.team.port 14700"),
         (["right.vehicle.ground.topic=carry-left"], "both members have ground.topic carry-left; give each"),
-        (["right.mission.phases[2].lift_m=0.3"], "both members must fly the same phases after grip"),
+        (["right.mission.phases[2].lift_m=0.3"], "both members must fly the same phases from grip on"),
+        (["left.mission.phases[1].bar.length_m=1.3"], "both members must fly the same phases from grip on"),
+        (["left.vehicle.safety.land_speed_m_s=0.2"], "safety.land_speed_m_s differs between the members"),
+        (["left.vehicle.devices.mocap.bar_id=4"], "devices.mocap.bar_id differs between the members"),
         (["left.vehicle.devices.mocap.server=192.168.1.11"], "devices.mocap.server differs between the members"),
         (
             ["left.vehicle.tether.anchor_world_m=[0.0,-1.9,0.0]", "right.vehicle.tether.anchor_world_m=[0.0,1.9,0.0]"],
@@ -74,6 +77,9 @@ def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
         "one port",
         "one name",
         "phases",
+        "bars",
+        "landing speeds",
+        "bodies of the bar",
         "servers",
         "tethers",
         "short bar",
@@ -85,6 +91,17 @@ def test_members_that_do_not_go_together_are_refused_in_one_line(overrides: list
     (line,) = problems(*overrides)
     assert line.startswith(f"{CARRY}: ")
     assert said in line
+
+
+def test_what_a_member_flies_before_grip_and_how_its_arm_holds_the_bar_are_its_own() -> None:
+    bar = "{length_m: 1.2, handle_height_m: 0.2, mass_max_kg: 0.5, position_m: [-1.0, 0.0], yaw_deg: 90}"
+    rest = "{type: carry, lift_m: 0.4, waypoints: [{position_m: [1.0, 0.0]}]}, {type: release, arm_deg: folded}"
+    overrides = ["vehicle.tether=null"]
+    for end, before, arm in (("left", "{type: hold, duration_s: 1.0}, ", "[70.0, 25.0]"), ("right", "", "carry")):
+        grip = f"{{type: grip, bar: {bar}, arm_deg: {arm}, end: {end}}}"
+        takeoff = "{type: takeoff, height_m: 1.0, duration_s: 3.0}"
+        overrides.append(f"{end}.mission.phases=[{takeoff}, {before}{grip}, {rest}, {{type: land, speed_m_s: 0.35}}]")
+    assert [len(config.mission.phases) for _, config in load_team(CARRY, overrides).members] == [6, 5]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Final
+from typing import Any, Final
 
 from companion.config.loader import FlightConfig
 from companion.config.vehicle import Vehicle
@@ -12,7 +12,7 @@ from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
 from companion.model.types import Reference, Vec3
 from companion.phases.carry.carry import Carry
-from companion.phases.carry.grip import APART_M
+from companion.phases.carry.grip import APART_M, GripHandle
 
 STEP_S: Final = 0.05
 ROUNDING_M: Final = 1e-6
@@ -40,13 +40,30 @@ def pair_problems(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
     ):
         if one == other:
             yield f"both members have {what} {one}; {advice}"
-    if left.mission.limits != right.mission.limits or left.mission.phases[2:] != right.mission.phases[2:]:
-        yield "both members must fly the same phases after grip, and with the same limits: they move one bar"
+    if left.mission.limits != right.mission.limits or _shared(left) != _shared(right):
+        yield "both members must fly the same phases from grip on, and with the same limits: they move one bar"
         return
+    if left.vehicle.safety.land_speed_m_s != right.vehicle.safety.land_speed_m_s:
+        yield "safety.land_speed_m_s differs between the members; an event lands both with the bar, whose ends must descend alike"
+    if left.vehicle.devices.mocap.bar_id != right.vehicle.devices.mocap.bar_id:
+        yield "devices.mocap.bar_id differs between the members; both carry one bar"
     one_server = left.vehicle.devices.mocap.server == right.vehicle.devices.mocap.server
     if not one_server:
         yield "devices.mocap.server differs between the members; both must receive the frames of one server, whose clock they share"
     yield from _near(left, right)
+
+
+def _shared(config: FlightConfig) -> list[dict[str, Any]]:
+    """Return the settings of the phases from the first `grip` on, without what each member has of its own."""
+    phases = phases_of(config.mission)
+    first = next(number for number, phase in enumerate(phases) if isinstance(phase, GripHandle))
+    own = {"end", "arm_deg"}
+    return [phase.model_dump(exclude=own if isinstance(phase, GripHandle) else None) for phase in phases[first:]]
+
+
+def _carry_begins_s(config: FlightConfig, plan: Plan) -> float:
+    index = next(number for number, phase in enumerate(phases_of(config.mission)) if isinstance(phase, Carry))
+    return next(segment.start_s for segment in plan.segments if segment.index == index)
 
 
 def _body(config: FlightConfig) -> int:
@@ -61,11 +78,10 @@ def _port(config: FlightConfig) -> int | None:
 def _near(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
     """Yield where the vehicles or their tethers come too near to each other."""
     plans = [Plan.build(config.mission, config.vehicle) for config in (left, right)]
-    index = next(number for number, phase in enumerate(phases_of(left.mission)) if isinstance(phase, Carry))
     least_m = left.vehicle.airframe.radius_m + right.vehicle.airframe.radius_m + APART_M
     near: tuple[float, float] | None = None
     crossed: tuple[float, float] | None = None
-    begun = [next(s.start_s for s in plan.segments if s.index == index) for plan in plans]
+    begun = [_carry_begins_s(config, plan) for config, plan in zip((left, right), plans, strict=True)]
     end_s = max(plan.duration_s - start_s for plan, start_s in zip(plans, begun, strict=True))
     # Before the bar is lifted each moves at a time of its own, so that no place of one way may be near any of the other.
     ways = [_way(plan, start_s) for plan, start_s in zip(plans, begun, strict=True)]
