@@ -221,7 +221,7 @@ class FlightCore:
             pose_s=self._pose_s,
             dt_s=dt_s,
             force_world_n=self._control.force_on_tool_n(i) if self._log is None else force_on_tool_n(self._log),
-            disturbance_world_n=None if self._observes else self._control.disturbance_world_n,
+            disturbance_world_n=None if self._observes or self._log is None else self._control.disturbance_world_n,
             position_error_m=_NO_ERROR
             if self._log is None
             else (self._log.error[0], self._log.error[1], self._log.error[2]),

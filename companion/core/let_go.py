@@ -15,6 +15,8 @@ from companion.model.team import ClampCommand, Grip, PartnerState, TeamState
 from companion.model.types import Inputs, SafetyAction, Vec3
 from companion.safety import notices
 
+CONFIRMED_SHARE: Final = 0.5
+"""Share of the limit that the vehicle's motion must show: its estimate of a sudden pull is 0.1 s late."""
 _HERE: Final = frozenset({Stage.MISSION, Stage.TOUCHDOWN, Stage.AUTOPILOT_LAND, Stage.DISARM, Stage.STAND_DOWN})
 _NOWHERE: Vec3 = (0.0, 0.0, 0.0)
 
@@ -37,7 +39,8 @@ def _why(t: Transition) -> str | None:
     bar, force = state.bar, t.o.force_world_n
     assert bar is not None
     limit_n = t.parameters.vehicle.safety.bar_let_go_n
-    if force is not None and state.grip is Grip.CARRYING and math.hypot(*force) > limit_n:
+    pulls = force is not None and state.grip is Grip.CARRYING and math.hypot(*force) > limit_n
+    if force is not None and pulls and _moves_so(t.o.disturbance_world_n, limit_n):
         return f"it pulls with {math.hypot(*force):.0f} N (limit {limit_n:.0f} N)"
     if state.supervisor.action is SafetyAction.TERMINATE:
         return "this vehicle falls"
@@ -51,6 +54,11 @@ def _why(t: Transition) -> str | None:
         if height_m is not None and height_m <= bar.let_go_m:
             return f"its feet are {max(0.0, height_m - bar.stands_m):.2f} m above the floor"
     return None
+
+
+def _moves_so(disturbance_world_n: Vec3 | None, limit_n: float) -> bool:
+    """Return whether the vehicle's motion confirms the pull, or is unknown: a wrong force sensor alone does not drop the bar."""
+    return disturbance_world_n is None or math.hypot(*disturbance_world_n) > CONFIRMED_SHARE * limit_n
 
 
 def _lands_otherwise(t: Transition, partner: PartnerState | None) -> bool:

@@ -89,7 +89,9 @@ class Observation(Record, frozen=True):
     force_world_n: Vec3 | None
     """Force on the tool in the last tick, world frame; if the law did not run, the measured one, and None if there is none."""
     disturbance_world_n: Vec3 | None
-    """Force on the vehicle that its motion shows, world frame; None on the ground, and if it is the force on the tool as well."""
+    """Force on the vehicle that its motion shows, world frame; None on the ground, if the law did not run, and if it is the force on
+    the tool as well.
+    """
     position_error_m: Vec3
     """Position minus reference in the last tick, world frame; 0 if the law did not run."""
     yaw_error_rad: float

@@ -57,7 +57,10 @@ def test_before_the_first_control_tick_there_is_no_error_and_no_mission_time() -
 def test_the_force_on_the_tool_is_known_while_px4_lands() -> None:
     """The law, which measures it in flight, does not run then, and a bar that pulls too hard is to be let go all the same."""
     core, i = core_in_flight(stage=Stage.AUTOPILOT_LAND), healthy()
-    assert core._observe(i, 0.005)[1].force_world_n is None, "without a tare"
+    core._control.disturbance_world_n = (1.0, 2.0, 3.0)
+    found = core._observe(i, 0.005)[1]
+    assert found.force_world_n is None, "without a tare"
+    assert found.disturbance_world_n is None, "it is that of the last tick in which the law ran"
     core._control.begin_tare()
     core._control.collect_tare(i)
     core._control.finish_tare()

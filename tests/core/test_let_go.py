@@ -54,7 +54,9 @@ def said(**fields: Any) -> PartnerState:
     return PartnerState(stamp_s=T_S - 0.01, said=replace(nominal, **fields))
 
 
-def observed(i: Inputs, force_n: float, reference: Reference | None = None) -> Observation:
+def observed(
+    i: Inputs, force_n: float, reference: Reference | None = None, shows_n: float | None = None
+) -> Observation:
     return Observation(
         inputs=i,
         airborne=True,
@@ -66,7 +68,7 @@ def observed(i: Inputs, force_n: float, reference: Reference | None = None) -> O
         pose_s=i.t_s,
         dt_s=0.005,
         force_world_n=(0.0, 0.0, -force_n),
-        disturbance_world_n=None,
+        disturbance_world_n=None if shows_n is None else (0.0, 0.0, -shows_n),
         position_error_m=ZERO3,
         yaw_error_rad=0.0,
     )
@@ -78,9 +80,10 @@ def after(
     partner: PartnerState | None = None,
     force_n: float = 2.0,
     texts: list[str] | None = None,
+    shows_n: float | None = None,
 ) -> FlightState:
     """The state after a tick; the texts of its events are added to `texts`."""
-    t = Transition(PARAMETERS, held, (), observed(inputs(height_m, partner), force_n))
+    t = Transition(PARAMETERS, held, (), observed(inputs(height_m, partner), force_n, shows_n=shows_n))
     let_go_if_better(t)
     if texts is not None:
         texts += [event.text for event in t.events]
@@ -124,6 +127,13 @@ def test_a_bar_that_is_carried_is_kept_at_any_height() -> None:
 def test_a_bar_that_pulls_too_hard_is_let_go_at_any_height(stage: Stage) -> None:
     assert not let_go(after(state(stage=stage), 1.3, said(), force_n=17.0))
     assert let_go(after(state(stage=stage), 1.3, said(), force_n=19.0))
+
+
+def test_a_wrong_force_sensor_alone_lets_no_bar_go() -> None:
+    """The limit is 18 N; the vehicle's motion, which shows a sudden pull later, must show half of it."""
+    assert not let_go(after(state(), 1.3, said(), force_n=25.0, shows_n=8.0))
+    assert let_go(after(state(), 1.3, said(), force_n=25.0, shows_n=10.0))
+    assert not let_go(after(state(), 1.3, said(), force_n=17.0, shows_n=25.0))
 
 
 def test_a_bar_that_is_let_go_in_the_mission_stays_let_go_and_the_vehicle_lands() -> None:
