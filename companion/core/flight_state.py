@@ -125,7 +125,7 @@ class FlightState(Record, frozen=True):
             return seq.SPOOL_SHARE * min(1.0, elapsed_s / seq.SPOOL_S)
         if self.stage is Stage.TOUCHDOWN:
             return max(0.0, min(seq.SPOOL_SHARE, self.touchdown.relief) * (1.0 - elapsed_s / seq.TOUCHDOWN_RAMP_S))
-        if not self.aborting and elapsed_s < seq.SPOOL_TO_FULL_S:
+        if elapsed_s < seq.SPOOL_TO_FULL_S:  # also in a landing that begins meanwhile
             return seq.SPOOL_SHARE + (1.0 - seq.SPOOL_SHARE) * elapsed_s / seq.SPOOL_TO_FULL_S
         return self.touchdown.relief
 

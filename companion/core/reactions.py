@@ -95,6 +95,8 @@ def _react(t: Transition) -> None:
             t.enter(Stage.AUTOPILOT_LAND, pilot_flies=state.supervisor.cause in _PILOT_FLIES)
     elif state.stage is Stage.SPOOL:
         t.finish(Outcome.ABORTED)
+        # The ramp down begins at the thrust that spooling up has reached.
+        t.change(touchdown=replace(state.touchdown, relief=state.vertical_scale(t.i.t_s)))
         t.enter(Stage.TOUCHDOWN)
     elif state.stage is Stage.MISSION:
         if action is _HOLD:

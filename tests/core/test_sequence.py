@@ -29,7 +29,7 @@ from companion.model.types import (
 from companion.safety.autopilot_landing import AutopilotLanding
 from companion.safety.rotor_stop import RotorStop
 from companion.safety.touchdown import Sinking
-from tests.core.test_reactions import CONFIG, P, ids, in_plan, tick
+from tests.core.test_reactions import CONFIG, P, after, ids, in_plan, tick
 from tests.safety.faults import EXTERNAL
 from tests.safety.healthy import fed_by_another, healthy, put
 
@@ -151,11 +151,19 @@ def test_spool_up_and_touchdown_scale_the_thrust() -> None:
     assert in_stage(Stage.SPOOL, 2.0).vertical_scale(NOW_S) == pytest.approx(0.7)
     assert in_stage(Stage.MISSION, 0.2).vertical_scale(NOW_S) == pytest.approx(0.85)
     assert in_stage(Stage.MISSION, 0.5).vertical_scale(NOW_S) == 1.0
-    assert in_stage(Stage.MISSION, 0.2, aborting=True).vertical_scale(NOW_S) == 1.0
+    assert in_stage(Stage.MISSION, 0.2, aborting=True).vertical_scale(NOW_S) == pytest.approx(0.85)
     assert in_stage(Stage.TOUCHDOWN, 0.1).vertical_scale(NOW_S) == pytest.approx(0.7 * 0.75)
     assert in_stage(Stage.TOUCHDOWN, 0.5).vertical_scale(NOW_S) == 0.0
     relieved = dataclasses.replace(P.initial_state().touchdown, relief=0.3)
     assert replace(in_plan(), touchdown=relieved).vertical_scale(NOW_S) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(("spooled_s", "share"), [(0.05, 0.03), (0.6, 0.35), (1.19, 0.69)])
+def test_rotors_that_are_called_off_spool_down_from_the_thrust_that_they_had(spooled_s: float, share: float) -> None:
+    state, _ = after(in_stage(Stage.SPOOL, spooled_s), "operator_land", SafetyAction.LAND)
+    assert state.stage is Stage.TOUCHDOWN and state.outcome is Outcome.ABORTED
+    assert state.vertical_scale(NOW_S) == pytest.approx(share, abs=0.01)
+    assert state.vertical_scale(NOW_S + 0.2) == pytest.approx(0.5 * share, abs=0.01)
 
 
 @pytest.mark.parametrize(

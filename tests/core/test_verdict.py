@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -239,6 +240,16 @@ def test_called_off_before_it_lifts(phase: str, command: OperatorCommand, text: 
     assert not stays or phase in ("wait", "offboard"), "the rotors may start after it is said"
     assert "takeoff" not in flown.ids
     assert not flown.flight.px4.armed
+
+
+@pytest.mark.parametrize(("phase", "late_s"), [("spool up", 0.045), ("take-off", 0.025)])
+def test_no_command_to_land_makes_the_rotors_surge(phase: str, late_s: float) -> None:
+    begin_s = times_of(ordinary())[phase] + late_s
+    flown = commanded((begin_s, LAND), until_s=begin_s + 0.5)
+    thrust = [o.attitude.thrust for o in flown.outputs if o.attitude is not None]
+    steps = [after - before for before, after in itertools.pairwise(thrust)]
+    assert max(steps) < 0.02, "more than spooling up adds in a tick"
+    assert [accepted for accepted, _ in flown.effects] == [True]
 
 
 def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
