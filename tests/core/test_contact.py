@@ -20,6 +20,7 @@ from companion.core.flight_core import FlightCore
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import replay
 from companion.mission.check import check_mission
+from companion.mission.plan import Plan
 from companion.model.contact import ContactMode
 from companion.model.outputs import Outputs
 from companion.model.types import Inputs, OperatorCommand
@@ -254,6 +255,25 @@ def test_a_hold_while_pressing_leads_away_from_the_wall_first() -> None:
     assert pressing.max() == 0.0
     floor = [o.reference.position_world_m for o in result.outputs if o.t_s > since_s + 1.0 and o.reference is not None]
     assert all(x < 0.85 for x, _, z in floor if z < 1.0)
+
+
+def test_a_hold_just_before_the_approach_touches_no_wall() -> None:
+    config = load_sitl(PRESS, world="ideal", overrides=[*SHORT, f"world.surfaces={json.dumps([WALL])}"])
+    plan = Plan.build(config.mission, config.vehicle)
+    begin_s = next(segment.start_s for segment in plan.segments if segment.index == 3)
+    flight = FastFlight(config)
+    step, asked = flight.core.step, list[float]()
+
+    def commanded(inputs: Inputs) -> Outputs:
+        outputs = step(replace(inputs, command=OperatorCommand.HOLD) if len(asked) == 1 else inputs)
+        if outputs.mission_t_s >= begin_s - 0.15:
+            asked.append(outputs.t_s)
+        return outputs
+
+    flight.core.step = commanded  # type: ignore[method-assign]
+    result = flight.run(until=after("operator_hold", 9.0))
+    assert "operator_hold" in events(result) and "touched" not in events(result) and not result.crashed
+    assert force_n(result).max() == 0.0
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from companion.model.contact import ContactMode, ContactState, TouchedPoint
 from companion.model.types import Inputs, Outcome, SafetyAction, Vec3
 from companion.phases.contact import force as c
 from companion.phases.contact.base import opening_of
+from companion.safety.supervisor import SupervisorState
 from tests.core.test_reactions import HERE, after, ids, in_plan, tick
 from tests.safety.healthy import healthy, put
 
@@ -72,6 +73,17 @@ def test_a_contact_begins_with_its_approach_and_the_rest_of_a_failed_one_is_skip
         assert state.expected.contact is None and plan_s(state) == pytest.approx(segment.end_s)
         assert state.skips
     assert not step(at_plan(AFTER.start_s + 0.1, None, skips=True))[0].skips
+
+
+@pytest.mark.parametrize("mode", [ContactMode.TARE, ContactMode.APPROACH, ContactMode.PRESS])
+def test_a_contact_that_begins_during_a_hold_is_left_at_once(mode: ContactMode) -> None:
+    held = SupervisorState(SafetyAction.HOLD, "operator_hold", NOW_S - 0.2)
+    state, _ = step(at_plan(IN_APPROACH, None, supervisor=held))
+    assert mode_of(state) is ContactMode.TARE
+    state, _ = step(at_plan(IN_APPROACH, contact(mode, 1.1, offset_m=0.1, touches=1), supervisor=held))
+    assert mode_of(state) is ContactMode.LEAVE
+    state, _ = step(at_plan(IN_APPROACH, contact(mode, 1.1), supervisor=held))
+    assert mode_of(state) is None and state.skips
 
 
 @pytest.mark.parametrize(

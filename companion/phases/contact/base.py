@@ -38,9 +38,10 @@ class ContactPhase(Phase):
         return way.speed_m_s
 
     def step(self, air: Air, own: Any) -> ContactState | None:
-        """Advance the contact, with what the phase at the plan's time does in it."""
+        """Advance the contact, with what the phase at the plan's time does in it; one that begins during a hold is left at once."""
         opening, phase = opening_of(air.phases[: air.segment.index + 1]), air.phases[air.segment.index]
         now = phase if isinstance(phase, ContactPhase) else opening
+        own = machine.leave(own, air.t_s) if air.holds else own
         return machine.advance(air, own, opening.way, now.touching, now.leave_m_s(opening.way), now.slides)
 
     def leave(self, own: Any, t_s: float) -> ContactState:
