@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Final
 
@@ -18,7 +19,16 @@ from companion.model import flight_stage as seq
 from companion.model.best_pose import best_pose, pose_used_s
 from companion.model.flight_stage import Stage
 from companion.model.frames import euler_zyx_from_quat
-from companion.model.types import AutopilotRequest, Inputs, Joints, Outcome, PhaseKind, SafetyAction, Severity
+from companion.model.types import (
+    AutopilotRequest,
+    AutopilotStatus,
+    Inputs,
+    Joints,
+    Outcome,
+    PhaseKind,
+    SafetyAction,
+    Severity,
+)
 from companion.safety import notices, rules
 from companion.safety.autopilot_landing import FLIPPED, KILLED, TIPPED
 from companion.safety.device_rules import PILOT_TOOK_OVER
@@ -28,10 +38,19 @@ from companion.safety.px4 import DISARMED_ABOVE_M
 from companion.safety.rules import CRASHED
 
 ARMED_SHOWN_S = 1.5
-"""PX4's HEARTBEAT reports once a second whether it is armed: for this time after a request to arm, "not armed" may be outdated."""
+"""PX4's HEARTBEAT reports once a second whether it is armed: for this time after a request to arm, and until the next HEARTBEAT,
+"not armed" may be outdated."""
 NO_TOUCHDOWN_S: Final = 5.0
 """Time after the plan's end within which touchdown must be detected; otherwise PX4 lands."""
 _NONE: Final = AutopilotRequest.NONE
+
+
+def may_be_armed(status: AutopilotStatus | None, t_s: float, requested_s: float) -> bool:
+    """Return whether PX4 is armed, or may be since the last request to arm, at `requested_s`: no later HEARTBEAT denies it."""
+    if seq.is_armed(status):
+        return True
+    heard_s = -math.inf if status is None else status.heartbeat_stamp_s
+    return requested_s > -math.inf and (t_s - requested_s <= ARMED_SHOWN_S or heard_s <= requested_s)
 
 
 def advance(t: Transition) -> AutopilotRequest:
@@ -203,7 +222,7 @@ def _arm(t: Transition, elapsed_s: float) -> AutopilotRequest:
 
 def _stand_down(t: Transition, elapsed_s: float) -> AutopilotRequest:
     i = t.i
-    if not seq.is_armed(i.status) and i.t_s - t.state.arm_requested_s > ARMED_SHOWN_S:
+    if not may_be_armed(i.status, i.t_s, t.state.arm_requested_s):
         t.enter(Stage.DONE)
     elif not _left_to_pilot(t) and elapsed_s > seq.DISARM_TIMEOUT_S:
         text = "PX4 did not disarm: its rotors may be turning; disarm it by the pilot's switch or from a ground station"

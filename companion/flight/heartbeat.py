@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from companion.core.sequence import ARMED_SHOWN_S
+from companion.core.sequence import may_be_armed
 from companion.guardian.client import GuardianClient
 from companion.guardian.heartbeat import Heartbeat
 from companion.model.best_pose import best_pose, pose_used_s
@@ -62,11 +62,10 @@ class Heartbeats:
         if pose_s is not None and pose is not None and outputs.mocap_trusted:
             self._pose_stamp_s = pose_s
             self._position_world_m, self._attitude_wxyz = pose.position_world_m, pose.attitude_wxyz
-        armed = inputs.status is not None and inputs.status.armed
         # PX4 reports only once a second whether it is armed, so it may be armed as soon as arming is requested.
         if outputs.request is AutopilotRequest.ARM:
             self._arm_s = inputs.t_s
-        may_lift = armed or inputs.t_s - self._arm_s <= ARMED_SHOWN_S or outputs.phase_kind in _IN_THE_AIR
+        may_lift = self.may_be_armed(inputs.status, inputs.t_s) or outputs.phase_kind in _IN_THE_AIR
         link = self._identity
         return Heartbeat(
             tick=inputs.tick,
@@ -87,6 +86,10 @@ class Heartbeats:
             peer=link.peer,
             back_world_m=self._back_world_m(outputs.contact),
         )
+
+    def may_be_armed(self, status: AutopilotStatus | None, t_s: float) -> bool:
+        """Return whether PX4 is armed, or may be since the last request to arm."""
+        return may_be_armed(status, t_s, self._arm_s)
 
     def _back_world_m(self, contact: ContactState | None) -> Vec3 | None:
         """Return the way back from the surface that the tool may touch; None if it touches none."""
@@ -149,7 +152,7 @@ class HeartbeatSender:
         """
         if self._last is None:
             return False
-        armed = (lost and self._last.lifting) or (now is not None and now.armed)
+        armed = (lost and self._last.lifting) or self._heartbeats.may_be_armed(now, self._last.t_s)
         self._last = msgspec.structs.replace(self._last, goodbye=True, lifting=armed)
         self._client.send_heartbeat(self._last)
         return armed and self.ready

@@ -135,6 +135,18 @@ def test_not_armed_is_believed_1_5_s_after_the_last_request_to_arm(requested_s: 
     assert tick(state, inputs=px4(armed=False), airborne=False)[0].stage is next_
 
 
+@pytest.mark.parametrize(("heard_after_s", "next_"), [(-0.1, Stage.STAND_DOWN), (0.1, Stage.DONE)])
+def test_not_armed_is_believed_of_a_heartbeat_after_the_request_to_arm(heard_after_s: float, next_: Stage) -> None:
+    state = in_stage(Stage.STAND_DOWN, 4.0, arm_requested_s=NOW_S - 4.0)
+    silent = put("status", heartbeat_stamp_s=NOW_S - 4.0 + heard_after_s)(px4(armed=False))
+    assert tick(state, inputs=silent, airborne=False)[0].stage is next_
+
+
+def test_a_flight_that_never_asked_px4_to_arm_ends_without_its_heartbeat() -> None:
+    silent = replace(healthy(), status=None)
+    assert tick(in_stage(Stage.STAND_DOWN, 0.1), inputs=silent, airborne=False)[0].stage is Stage.DONE
+
+
 @pytest.mark.parametrize(("late_s", "lands"), [(4.9, False), (5.1, True)])
 def test_a_plan_that_ends_without_touchdown_is_landed_by_px4_after_five_seconds(late_s: float, lands: bool) -> None:
     plan_s = Plan.build(CONFIG.mission, CONFIG.vehicle).duration_s

@@ -134,6 +134,13 @@ def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
     return Inputs(tick=9, t_s=5.0, status=status, mocap=mocap, command=OperatorCommand.NONE, recorder_dropped=0)
 
 
+def heard(t_s: float) -> Inputs:
+    """Inputs with a heartbeat of this moment: PX4 is not armed."""
+    status = inputs().status
+    assert status is not None
+    return msgspec.structs.replace(inputs(), t_s=t_s, status=msgspec.structs.replace(status, heartbeat_stamp_s=t_s))
+
+
 @pytest.fixture(scope="module")
 def waiting() -> Outputs:
     """Return the core's outputs on the ground, in the first tick."""
@@ -194,12 +201,28 @@ def test_the_rotors_may_start_for_as_long_as_px4_takes_to_say_that_it_is_armed(p
     requests = {0.0: AutopilotRequest.ARM}
     for after_s in (0.0, 0.005, 1.4, 1.6):
         request_ = requests.get(after_s, AutopilotRequest.DISARM)
-        seen = msgspec.structs.replace(inputs(), t_s=5.0 + after_s)
+        seen = heard(5.0 + after_s)
         guard.tick(seen, msgspec.structs.replace(waiting, request=request_))
         beat = heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES))
         assert beat is not None
         lifting.append(beat.lifting)
     assert lifting == [True, True, True, False]
+
+
+def test_until_px4_is_heard_after_the_request_to_arm_the_guardian_is_not_dismissed(
+    pair: Pair, waiting: Outputs
+) -> None:
+    client, guardian = pair
+    guard = HeartbeatSender(client, LINK, 0.0)
+    guardian.send(heartbeat.READY)
+    assert guard.ready
+    guard.tick(heard(5.0), msgspec.structs.replace(waiting, request=AutopilotRequest.ARM))
+    guard.tick(msgspec.structs.replace(inputs(), t_s=13.0), msgspec.structs.replace(waiting, phase_kind=PhaseKind.DONE))
+    assert guard.goodbye(inputs().status)
+    assert guard.goodbye(None)
+    assert not guard.goodbye(heard(12.9).status)
+    beats = [heartbeat.unpack(guardian.recv(heartbeat.MAX_BYTES)) for _ in range(5)]
+    assert [beat is not None and beat.lifting for beat in beats] == [True, True, True, True, False]
 
 
 def test_while_px4_may_be_armed_the_guardian_is_left_with_it_at_the_end(pair: Pair, waiting: Outputs) -> None:
