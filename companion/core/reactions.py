@@ -90,9 +90,11 @@ def _react(t: Transition) -> None:
         t.finish(Outcome.CRASHED)
         t.enter(Stage.AUTOPILOT_LAND, flipped=True)
     elif action is SafetyAction.AUTOPILOT_LAND:
-        if state.stage in seq.LIFTING:
+        pilot_flies = state.supervisor.cause in _PILOT_FLIES
+        # A landing by PX4 that has begun goes on; only a pilot ends it.
+        if state.stage in seq.LIFTING and (pilot_flies or state.stage is not Stage.AUTOPILOT_LAND):
             t.finish(Outcome.ABORTED)
-            t.enter(Stage.AUTOPILOT_LAND, pilot_flies=state.supervisor.cause in _PILOT_FLIES)
+            t.enter(Stage.AUTOPILOT_LAND, pilot_flies=pilot_flies)
     elif state.stage is Stage.SPOOL:
         t.finish(Outcome.ABORTED)
         # The ramp down begins at the thrust that spooling up has reached.

@@ -298,6 +298,18 @@ def in_landing(outcome: Outcome = Outcome.ABORTED, **begun: Any) -> FlightState:
     return in_stage(Stage.AUTOPILOT_LAND, 2.0, landing=landing, outcome=outcome)
 
 
+@pytest.mark.parametrize(("event_id", "goes_on"), [("mocap_lost", True), ("pilot_took_over", False)])
+def test_a_landing_by_px4_that_began_without_a_rule_does_not_begin_anew(event_id: str, goes_on: bool) -> None:
+    """Neither `no_touchdown` nor `disarm_refused` escalates the supervisor."""
+    state = in_landing()
+    assert state.landing is not None and state.supervisor.action is SafetyAction.NOMINAL
+    state = replace(state, landing=dataclasses.replace(state.landing, touched_s=NOW_S - 1.0))
+    state, _ = after(state, event_id, SafetyAction.AUTOPILOT_LAND)
+    assert state.landing is not None and state.supervisor.action is SafetyAction.AUTOPILOT_LAND
+    assert (state.landing.touched_s is not None, state.pilot_flies) == (goes_on, not goes_on)
+    assert state.entered_s == (NOW_S - 2.0 if goes_on else NOW_S)
+
+
 @pytest.mark.parametrize(("height_m", "outcome"), [(0.46, Outcome.CRASHED), (0.44, Outcome.ABORTED)])
 def test_a_kill_in_the_air_is_a_crash(height_m: float, outcome: Outcome) -> None:
     there = {"position_world_m": (0.0, 0.0, height_m)}
