@@ -54,11 +54,17 @@ class RemoteClock:
             remote_s: time on the device's clock at which it sent a message.
             arrived_s: arrival of that message on the flight clock.
         """
+        self._offset_s, self._arrived_s = self._new_offset_s(remote_s, arrived_s), arrived_s
+        return remote_s + self._offset_s
+
+    def would_be_s(self, remote_s: float, arrived_s: float) -> float:
+        """Convert `remote_s` as `local_s` does. Changes nothing."""
+        return remote_s + self._new_offset_s(remote_s, arrived_s)
+
+    def _new_offset_s(self, remote_s: float, arrived_s: float) -> float:
         offset_s = arrived_s - remote_s
         grown_s = self._offset_s + self._growth * max(0.0, arrived_s - self._arrived_s)
-        self._arrived_s = arrived_s
-        self._offset_s = offset_s if offset_s > grown_s + CLOCK_RESTART_S else min(grown_s, offset_s)
-        return remote_s + self._offset_s
+        return offset_s if offset_s > grown_s + CLOCK_RESTART_S else min(grown_s, offset_s)
 
 
 class InertialCheck:

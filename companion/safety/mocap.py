@@ -9,6 +9,7 @@ the operator, are in `companion.safety.rules`.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Final
 
 from companion.config.safety import Safety
@@ -181,7 +182,7 @@ class MocapTracker:
         In the air a repeated pose is withheld, long before `mocap_frozen`, because it suggests a vehicle at rest.
         """
         frame = self.frame
-        if not pose.tracking_valid or self._filter.is_too_late(pose):
+        if not pose.tracking_valid or self._filter.exceeds(_latency_s(pose, self._server_clock.would_be_s)):
             return False
         if frame is None or pose.stamp_s == frame.stamp_s:  # the first, or one that a tick has evaluated
             return self.trusted and not (self.repeats and airborne)
@@ -220,7 +221,7 @@ class MocapTracker:
             self._trusted_awake_s = awake_s  # a stream may begin within a burst of lost frames
         gone_s = awake_s - self._frame_awake_s
         self.frame, self._frame_awake_s = pose, awake_s
-        self._measure_latency(pose)
+        self.latency_s = _latency_s(pose, self._server_clock.local_s)
         self._window_frames += 1
         self._streams.update(pose.frame_number, (pose.position_world_m, pose.attitude_wxyz), awake_s)
         # The gap was reported as a loss; a rate across it does not describe this stream.
@@ -236,7 +237,7 @@ class MocapTracker:
             self._same_since_s, self._moved = None, False
         elif self._same_since_s is None and self.repeats:
             self._same_since_s, self._moved = awake_s, False
-        self.too_late = self._filter.is_too_late(pose)
+        self.too_late = self._filter.exceeds(self.latency_s)
         off = self._filter.evaluate(pose, vehicle, forgotten=gone_s > FORGET_S and not airborne)
         self.plausible = off is None
         if off is None:
@@ -249,17 +250,6 @@ class MocapTracker:
         else:
             self.off = off
             self._against_imu = False
-
-    def _measure_latency(self, pose: MocapPose) -> None:
-        """Update the latency with a new frame.
-
-        If the pose's latency ends at the transmission, the delay on the network beyond its smallest is added.
-        """
-        self.latency_s = pose.latency_s
-        if pose.exposure_server_s is not None:
-            latency_s = pose.latency_s or 0.0
-            sent_s = self._server_clock.local_s(pose.exposure_server_s + latency_s, pose.stamp_s)
-            self.latency_s = latency_s + pose.stamp_s - sent_s
 
     def _age_s(self, pose: MocapPose) -> float:
         """Return the time from the exposure of a pose to the newest IMU sample, limited; negative if the pose is newer."""
@@ -274,6 +264,18 @@ class MocapTracker:
         elif awake_s - start_s >= RATE_WINDOW_S:
             self.rate_hz = self._window_frames / (awake_s - start_s)
             self._window_awake_s, self._window_frames = awake_s, 0
+
+
+def _latency_s(pose: MocapPose, local_s: Callable[[float, float], float]) -> float | None:
+    """Return the time from the exposure of a pose to its arrival; None if it is unknown.
+
+    If the pose's latency ends at the transmission, the delay on the network beyond its smallest is added, by `local_s` of the
+    server's clock.
+    """
+    if pose.exposure_server_s is None:
+        return pose.latency_s
+    latency_s = pose.latency_s or 0.0
+    return latency_s + pose.stamp_s - local_s(pose.exposure_server_s + latency_s, pose.stamp_s)
 
 
 def mocap_lost(m: MocapTracker, timeout_s: float) -> Values | None:

@@ -79,7 +79,11 @@ class PoseFilter:
 
     def is_too_late(self, pose: MocapPose) -> bool:
         """Return whether a pose is so old that it counts as lost."""
-        return pose.latency_s is not None and pose.latency_s > self._limits.latency_max_s
+        return self.exceeds(pose.latency_s)
+
+    def exceeds(self, latency_s: float | None) -> bool:
+        """Return whether a latency is so large that a pose with it counts as lost."""
+        return latency_s is not None and latency_s > self._limits.latency_max_s
 
     def deviation(self, pose: MocapPose, vehicle: VehicleState | None) -> Vec2 | None:
         """Return None if the pose is reachable, else how far it is from the expected one, in m and deg. Changes nothing. Arguments as

@@ -56,10 +56,15 @@ def between_ticks(tick: int, change: Change = lambda i: i) -> MocapPose:
     return replace(pose, stamp_s=pose.stamp_s + 0.002, position_world_m=(*pose.position_world_m[:2], 0.99995))
 
 
+def delayed(latency_s: float) -> Change:
+    """Poses that were exposed this long before they arrive."""
+    return lambda i: put("mocap", latency_s=latency_s, exposure_server_s=i.t_s - latency_s)(i)
+
+
 BAD: dict[str, Change] = {
     "shifted": moved("mocap", (0.0, 0.3, 0.0)),
     "turned": turned("mocap", 180.0),
-    "too late": put("mocap", latency_s=0.13),
+    "too late": delayed(0.13),
     "not tracked": put("mocap", tracking_valid=False),
 }
 
@@ -95,7 +100,7 @@ def test_a_pose_that_is_too_late_counts_as_not_received() -> None:
     """PX4 lands on its own estimate then, and what it does shows more than a pose that PX4 does not get."""
     monitors = Monitors(VEHICLE)
     watched(VEHICLE, [healthy(k) for k in range(3)], flying(), monitors)
-    late = put("mocap", latency_s=0.13)
+    late = delayed(0.13)
     monitors.check(late(healthy(3)), flying())
     assert not monitors.mocap_trusted
     assert monitors.trusted is not None and monitors.trusted.mocap == healthy(2).mocap
@@ -140,6 +145,26 @@ def test_a_delay_that_the_servers_stamps_do_not_contain_is_measured_against_the_
 
     events = watched(VEHICLE, (held(healthy(k)) for k in range(300)), flying())
     assert [event.id for event in events] == [id_]
+
+
+@pytest.mark.parametrize(("late_s", "passes"), [(0.06, True), (0.15, False)])
+def test_a_pose_whose_measured_delay_is_too_large_is_not_passed_on(late_s: float, passes: bool) -> None:
+    """Its own latency ends at the transmission: the delay on the network shows only against the server's clock."""
+
+    def held(i: Inputs) -> Inputs:
+        assert i.mocap is not None and i.mocap.exposure_server_s is not None
+        return put("mocap", exposure_server_s=i.mocap.exposure_server_s - late_s)(i)
+
+    monitors = Monitors(VEHICLE)
+    watched(VEHICLE, [healthy(k) for k in range(100)], flying(), monitors)
+    vehicle, between = healthy(99).vehicle, between_ticks(99)
+    assert between.exposure_server_s is not None and monitors.forwards(between, vehicle)
+    late = replace(between, exposure_server_s=between.exposure_server_s + 0.002 - late_s)
+    assert monitors.forwards(late, vehicle) is passes
+    monitors.check(held(healthy(100)), flying())
+    assert monitors.mocap_trusted is passes
+    evaluated = held(healthy(100)).mocap
+    assert evaluated is not None and monitors.forwards(evaluated, vehicle) is passes
 
 
 def test_bad_poses_of_every_kind_in_turn_are_no_motion_capture() -> None:
