@@ -104,9 +104,7 @@ def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
     elif was_ready:  # the vehicle was moved, and may be put back
         t.change_waiting(unready=problems[0])
     else:
-        for problem in problems:
-            t.report(notices.START_REFUSED, problem)
-        t.stand_down(Outcome.REFUSED)
+        _refuse_start(t, problems)
 
 
 def _is_ready(t: Transition) -> None:
@@ -160,9 +158,10 @@ def _weigh(t: Transition) -> None:
 
 
 def _misplaced(t: Transition) -> list[str]:
-    """Return how the vehicle's pose differs from the mission's start, or an empty list if it does not."""
+    """Return how the vehicle's pose differs from the mission's start, or an empty list if it does not or is unknown."""
     vehicle, p = t.i.vehicle, t.parameters
-    assert vehicle is not None
+    if vehicle is None or (p.vehicle.arm.joints and t.i.arm is None):
+        return []
     yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
     return check_start(p.config.mission, p.vehicle, vehicle.position_world_m, yaw_rad, _arm_rad(t))
 
@@ -190,6 +189,12 @@ def _decline_start(t: Transition) -> None:
     t.report(notices.START_DECLINED, text)
 
 
+def _refuse_start(t: Transition, problems: list[str]) -> None:
+    for problem in problems:
+        t.report(notices.START_REFUSED, problem)
+    t.stand_down(Outcome.REFUSED)
+
+
 def _refuse(t: Transition, notice: EventDefinition, text: str) -> None:
     t.report(notice, text)
     t.stand_down(Outcome.REFUSED)
@@ -210,6 +215,9 @@ def _arm(t: Transition, elapsed_s: float) -> AutopilotRequest:
     t_s = t.i.t_s
     if seq.is_armed(t.i.status):
         assert t.state.plan is not None
+        if problems := _misplaced(t):  # since the start was commanded
+            _refuse_start(t, problems)
+            return _NONE
         t.change(course=ActiveTrajectory(t.state.plan, t_s + seq.SPOOL_S))
         t.enter(Stage.SPOOL)
     elif elapsed_s > seq.ARM_TIMEOUT_S:

@@ -44,7 +44,10 @@ ESTIMATE_UNSTEADY = EventDefinition(
     "drift): the flight is refused",
 )  # fmt: skip
 START_REFUSED = EventDefinition(
-    "start_refused", _CRITICAL, _NOMINAL, "the vehicle's pose is not the mission's start: the flight is refused"
+    "start_refused",
+    _CRITICAL,
+    _NOMINAL,
+    "the vehicle's pose is not the mission's start, or is not any more once PX4 has armed: the flight is refused",
 )
 OFFBOARD_REFUSED = EventDefinition(
     "offboard_refused", _CRITICAL, _NOMINAL, "PX4 did not enter OFFBOARD within 8 s: the flight is refused"

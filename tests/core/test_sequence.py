@@ -54,6 +54,17 @@ def px4(mode: FlightMode = FlightMode.OFFBOARD, *, armed: bool = True, landed: b
 OTHER = FlightMode.OTHER
 
 
+def at_start(x_m: float = -1.0) -> Inputs:
+    """On the ground at the mission's start, or beside it, with the arm folded."""
+    level = {"position_world_m": (x_m, 0.0, 0.3), "attitude_wxyz": (1.0, 0.0, 0.0, 0.0)}
+    i = put("mocap", **level)(put("vehicle", **level)(px4(OTHER, armed=False, landed=True)))
+    return put("arm", angle_rad=P.fold_rad)(i)
+
+
+def armed_at(x_m: float) -> Inputs:
+    return put("status", mode=FlightMode.OFFBOARD, armed=True)(at_start(x_m))
+
+
 @pytest.mark.parametrize(
     ("stage", "elapsed_s", "inputs", "request_", "next_", "event"),
     [
@@ -66,7 +77,9 @@ OTHER = FlightMode.OTHER
         (Stage.ARM, 0.0, px4(armed=False), ARM, Stage.ARM, None),
         (Stage.ARM, 9.99, px4(armed=False), ARM, Stage.ARM, None),
         (Stage.ARM, 10.01, px4(armed=False), NONE, Stage.STAND_DOWN, "arming_refused"),
-        (Stage.ARM, 1.0, px4(), NONE, Stage.SPOOL, None),
+        (Stage.ARM, 1.0, armed_at(-1.0), NONE, Stage.SPOOL, None),
+        (Stage.ARM, 1.0, armed_at(-0.7), NONE, Stage.STAND_DOWN, "start_refused"),  # carried away since the start
+        (Stage.ARM, 1.0, replace(armed_at(-0.7), arm=None), NONE, Stage.SPOOL, None),  # a rule's matter
         (Stage.SPOOL, 1.19, px4(), NONE, Stage.SPOOL, None),
         (Stage.SPOOL, 1.21, px4(), NONE, Stage.MISSION, "takeoff"),
         (Stage.TOUCHDOWN, 0.39, px4(), NONE, Stage.TOUCHDOWN, None),
@@ -238,13 +251,6 @@ def ready(i: Inputs, *, looked_s: float = 0.05, tared_s: float = 0.5) -> FlightS
         P.initial_state().waiting, was_ready=True, looked_s=NOW_S - looked_s, tare_start_s=NOW_S - tared_s
     )
     return in_stage(Stage.READY, 5.0, waiting=replace(waiting, settled=settled), plan=None, course=None)
-
-
-def at_start(x_m: float = -1.0) -> Inputs:
-    """On the ground at the mission's start, or beside it, with the arm folded."""
-    level = {"position_world_m": (x_m, 0.0, 0.3), "attitude_wxyz": (1.0, 0.0, 0.0, 0.0)}
-    i = put("mocap", **level)(put("vehicle", **level)(px4(OTHER, armed=False, landed=True)))
-    return put("arm", angle_rad=P.fold_rad)(i)
 
 
 START = Event(t_s=NOW_S, id="operator_start", severity=Severity.INFO, action=SafetyAction.NOMINAL, text="")
