@@ -16,7 +16,7 @@ from companion.control.types import MakeLaw, Tuning
 from companion.control.vehicle_control import Command, VehicleControl
 from companion.core.flight_state import Request, Tare
 from companion.core.let_go import team_state_of
-from companion.core.phase_tick import checked, failed
+from companion.core.phase_tick import checked_reference, failed
 from companion.core.sequence import missing_inputs
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
@@ -296,7 +296,8 @@ class FlightCore:
         if state.own is not None and engaged is not None:
             phase = self._parameters.phases[engaged.index]
             try:
-                reference = checked(Reference, phase.reference(reference, state.own))
+                returned = phase.reference(reference, state.own)
+                reference = checked_reference(returned, len(self._vehicle.arm.joints))
             except Exception as error:  # the next tick lands
                 self._phase_error = str(failed(phase, error))
                 reference = self._reference or reference

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from companion.core.transition import Transition
@@ -17,6 +18,7 @@ from companion.safety.notices import EventDefinition
 from companion.safety.supervisor import SupervisorState
 
 _BEFORE_END_S = 1e-6
+_OF_JOINTS = frozenset({"arm_rad", "arm_rate_rad_s", "arm_acceleration_rad_s2"})
 
 
 class PhaseFailed(Exception):
@@ -43,6 +45,23 @@ def checked(cls: type[R], returned: object) -> R:
     """
     record: R = from_packet(cls, to_packet(returned))
     return record
+
+
+def checked_reference(returned: object, joints: int) -> Reference:
+    """Return what a phase has returned, as a reference with finite values for an arm of so many joints.
+
+    Raises:
+        RecordError, TypeError, ValueError, OverflowError: it is none.
+    """
+    reference = checked(Reference, returned)
+    for name in Reference.__struct_fields__:
+        value = getattr(reference, name)
+        values = value if isinstance(value, tuple) else () if value is None else (value,)
+        if not all(map(math.isfinite, values)):
+            raise RecordError(f"reference() returned {name} {value}, expected finite values")
+        if name in _OF_JOINTS and len(values) != joints:
+            raise RecordError(f"reference() returned {name} of {len(values)} joints, expected {joints}")
+    return reference
 
 
 def advance_phase(t: Transition) -> None:

@@ -174,6 +174,14 @@ RAISES = {
         "    def begin(",
         "    def reference(self, reference, own):\n        return replace(reference, position_world_m=(0.0, 1.0))\n\n    def begin(",
     ),
+    "not finite": (
+        "    def begin(",
+        "    def reference(self, reference, own):\n        return replace(reference, yaw_rad=float('nan'))\n\n    def begin(",
+    ),
+    "joints": (
+        "    def begin(",
+        "    def reference(self, reference, own):\n        return replace(reference, arm_rad=(0.0,))\n\n    def begin(",
+    ),
     "expects": ("    def begin(", "    def expects(self, own):\n        return None\n\n    def begin("),
     "leave": ("    def begin(", "    def leave(self, own, t_s):\n        return own.n\n\n    def begin("),
 }
@@ -205,5 +213,5 @@ def test_a_phase_that_raises_in_the_air_is_named_and_the_vehicle_lands(site: Pat
         assert SafetyAction.AUTOPILOT_LAND not in {output.action for output in outputs}, "lands under its own control"
     (event,) = [event for output in outputs for event in output.events if event.id == "phase_failed"]
     assert event.text.startswith("phase 'weigh' failed: ")
-    assert ("(lab_weigh.py:" in event.text) != method.startswith(("short", "expects")), event.text
+    assert ("(lab_weigh.py:" in event.text) != method.startswith(("short", "not", "joints", "expects")), event.text
     assert SafetyAction.LAND in {output.action for output in outputs}
