@@ -36,6 +36,7 @@ from companion.safety.mocap import unfused
 from companion.safety.notices import EventDefinition
 from companion.safety.px4 import DISARMED_ABOVE_M
 from companion.safety.rules import CRASHED
+from companion.safety.touchdown import MOCAP_FRESH_S
 
 ARMED_SHOWN_S = 1.5
 """PX4's HEARTBEAT reports once a second whether it is armed: for this time after a request to arm, and until the next HEARTBEAT,
@@ -318,7 +319,7 @@ def _disarm(t: Transition, elapsed_s: float) -> AutopilotRequest:
 def _autopilot_land(t: Transition, _: float) -> AutopilotRequest:
     assert t.state.landing is not None
     i = t.i
-    if seq.is_killed(i.status) and i.vehicle is not None:
+    if (seq.is_killed(i.status) or _disarmed_in_view(t)) and i.vehicle is not None:
         if i.vehicle.position_world_m[2] > t.parameters.clearance_m + DISARMED_ABOVE_M:
             t.finish(Outcome.CRASHED)  # without rotors it falls
     landing, step = t.state.landing.step(i, t.o.late_pose)
@@ -333,6 +334,17 @@ def _autopilot_land(t: Transition, _: float) -> AutopilotRequest:
             t.change(outcome=Outcome.LOST)
         t.enter(Stage.DONE)
     return step.request
+
+
+def _disarmed_in_view(t: Transition) -> bool:
+    """Return whether PX4 reports that it is disarmed and fresh poses show the vehicle above the floor: without them
+    PX4's height may be wrong. Not while a pilot flies, who may land on anything.
+    """
+    i, pose, used_s = t.i, best_pose(t.i), pose_used_s(t.i)
+    if i.status is None or i.status.armed or t.state.pilot_flies or pose is None or used_s is None:
+        return False
+    high = pose.position_world_m[2] > t.parameters.clearance_m + DISARMED_ABOVE_M
+    return high and i.t_s - used_s < MOCAP_FRESH_S
 
 
 def _done(_: Transition, __: float) -> AutopilotRequest:

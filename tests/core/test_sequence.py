@@ -323,6 +323,29 @@ def test_a_kill_in_the_air_is_a_crash(height_m: float, outcome: Outcome) -> None
     assert tick(in_landing(), inputs=killed)[0].outcome is outcome
 
 
+@pytest.mark.parametrize(
+    ("px4_m", "mocap_m", "age_s", "pilot", "outcome"),
+    [
+        (1.0, 1.0, 0.0, False, Outcome.CRASHED),
+        (1.0, 0.3, 0.0, False, Outcome.ABORTED),
+        (0.3, 1.0, 0.0, False, Outcome.ABORTED),
+        (1.0, 1.0, 0.4, False, Outcome.ABORTED),  # on the floor an estimate without poses may show any height
+        (1.0, 1.0, 0.0, True, Outcome.ABORTED),
+    ],
+)
+def test_a_disarm_in_the_air_is_a_crash(
+    px4_m: float, mocap_m: float, age_s: float, pilot: bool, outcome: Outcome
+) -> None:
+    seen = put("mocap", position_world_m=(0.0, 0.0, mocap_m), stamp_s=NOW_S - age_s)(px4(armed=False))
+    disarmed = put("vehicle", position_world_m=(0.0, 0.0, px4_m))(seen)
+    assert tick(in_landing(pilot=pilot), inputs=disarmed)[0].outcome is outcome
+
+
+def test_px4_that_disarms_during_the_mission_has_crashed_the_vehicle() -> None:
+    state, _ = after(in_plan(), "px4_disarmed", SafetyAction.AUTOPILOT_LAND, inputs=px4(armed=False))
+    assert (state.stage, state.outcome) == (Stage.AUTOPILOT_LAND, Outcome.CRASHED)
+
+
 @pytest.mark.parametrize(("before", "reported"), [(Outcome.ABORTED, "crashed"), (Outcome.CRASHED, "autopilot_landing")])
 def test_a_flipped_vehicle_is_reported_as_a_crash_once(before: Outcome, reported: str) -> None:
     over = {"attitude_wxyz": (0.0, 1.0, 0.0, 0.0)}
