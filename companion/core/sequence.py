@@ -89,12 +89,15 @@ def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
     _weigh(t)
     tare_start_s = t.state.waiting.tare_start_s
     assert tare_start_s is not None
-    if i.t_s - tare_start_s < seq.TARE_S:
+    settled, tared = t.state.waiting.settled, i.t_s - tare_start_s >= seq.TARE_S
+    wanders = settled.problem(i.t_s)
+    if not tared and (wanders is None or not settled.lasted(i.t_s)):
         t.change_waiting(unready="the vehicle has not stood still for long enough; meanwhile a force sensor is tared")
         return
-    wanders = t.state.waiting.settled.problem(i.t_s)
     if wanders is not None:
         t.change_waiting(unready=wanders)
+        if tared:  # while something moved
+            _begin_tare(t)
         if overdue:
             _refuse(t, notices.ESTIMATE_UNSTEADY, wanders)
         return

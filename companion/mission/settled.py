@@ -1,5 +1,5 @@
-"""Checks that PX4's estimate has converged to motion capture, as the core's last check before it requests OFFBOARD. Pure; time is
-an argument.
+"""Checks that the vehicle is at rest and PX4's estimate has converged to motion capture, as the core's last check before it requests
+OFFBOARD. Pure; time is an argument.
 
 An estimate that has only begun to follow is close for a moment; one that has converged stays close. PX4's position and yaw are
 compared with those of motion capture while the vehicle is on the ground. If another program feeds PX4 there is no motion capture to
@@ -31,8 +31,9 @@ _NOWHERE: Vec3 = (0.0, 0.0, 0.0)
 class SettledEstimate:
     """Differences between PX4's estimate and motion capture over the last `SETTLED_S`."""
 
-    seen: tuple[tuple[float, Vec3, float], ...] = ()
-    """Time on the flight clock (s), and position (m) and yaw (rad) of the estimate minus those of motion capture, if there is any."""
+    seen: tuple[tuple[float, Vec3, float, Vec3], ...] = ()
+    """Time on the flight clock (s), position (m) and yaw (rad) of the estimate minus those of motion capture, if there is any, and the
+    position by motion capture."""
     alone: bool = False
     """Whether there is no motion capture to compare with."""
     since_s: float | None = None
@@ -47,23 +48,31 @@ class SettledEstimate:
         first = 0
         while first < len(self.seen) and self.seen[first][0] < t_s - SETTLED_S:
             first += 1
-        seen = (*self.seen[first:], (t_s, (x - a, y - b, z - c), wrap_rad(yaw_rad)))
+        seen = (*self.seen[first:], (t_s, (x - a, y - b, z - c), wrap_rad(yaw_rad), (a, b, c)))
         return SettledEstimate(seen, pose is None, t_s if self.since_s is None else self.since_s)
 
     @property
     def _compared_with(self) -> str:
         return f"that of {SETTLED_S:g} s ago" if self.alone else "that of motion capture"
 
+    def lasted(self, t_s: float) -> bool:
+        """Return whether there is evidence of `SETTLED_S`."""
+        return self.since_s is not None and t_s - self.since_s >= SETTLED_S
+
     def problem(self, t_s: float) -> str | None:
-        """Return a message that says what has not converged, or None if everything has for `SETTLED_S`."""
-        if self.since_s is None or t_s - self.since_s < SETTLED_S:
+        """Return a message that says what moves or has not converged; None if the vehicle has been at rest for `SETTLED_S`."""
+        if not self.lasted(t_s):
             return f"PX4's estimate has not followed motion capture for {SETTLED_S:g} s without interruption"
         count = len(self.seen)
-        _, (a, b, c), first_rad = self.seen[0] if self.alone else (0.0, _NOWHERE, 0.0)
-        apart = [(x - a, y - b, z - c) for _, (x, y, z), _ in self.seen]
-        turned_rad = [wrap_rad(yaw - first_rad) for _, _, yaw in self.seen]
-        mean = [math.fsum(off[axis] for off in apart) / count for axis in range(3)]
-        spread_m = math.sqrt(math.fsum(math.dist(off, mean) ** 2 for off in apart) / count)
+        moved_m = _spread_m([position for _, _, _, position in self.seen])[1]
+        if moved_m > SPREAD_MAX_M:
+            return (
+                f"the vehicle does not stand still: its position has moved by {moved_m * 1e3:.0f} mm in the last {SETTLED_S:g} s "
+                f"(allowed: {SPREAD_MAX_M * 1e3:.0f} mm); leave it alone"
+            )
+        _, (a, b, c), first_rad, _ = self.seen[0] if self.alone else (0.0, _NOWHERE, 0.0, _NOWHERE)
+        mean, spread_m = _spread_m([(x - a, y - b, z - c) for _, (x, y, z), _, _ in self.seen])
+        turned_rad = [wrap_rad(yaw - first_rad) for _, _, yaw, _ in self.seen]
         yaw_rad = math.fsum(turned_rad) / count
         yaw_spread_rad = math.sqrt(math.fsum((yaw - yaw_rad) ** 2 for yaw in turned_rad) / count)
         off_m = math.hypot(*mean)
@@ -83,3 +92,10 @@ class SettledEstimate:
             f"PX4's estimate has not settled in the last {SETTLED_S:g} s: {', '.join(wrong)}; do not move the vehicle, "
             "and check that PX4 and Motive use the same body and axes (EKF2_EV_DELAY, EKF2_EVP_NOISE, the rigid body's markers)"
         )
+
+
+def _spread_m(positions_m: list[Vec3]) -> tuple[list[float], float]:
+    """Return the mean of positions, and their standard deviation over all three axes."""
+    count = len(positions_m)
+    mean = [math.fsum(position[axis] for position in positions_m) / count for axis in range(3)]
+    return mean, math.sqrt(math.fsum(math.dist(position, mean) ** 2 for position in positions_m) / count)

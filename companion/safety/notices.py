@@ -41,7 +41,7 @@ VISION_NOT_FUSED = EventDefinition(
 ESTIMATE_UNSTEADY = EventDefinition(
     "estimate_unsteady", _CRITICAL, _NOMINAL,
     "PX4's estimate has not been near motion capture and steady for 1 s (0.05 m, 5 deg on average; 0.02 m, 2 deg of "
-    "drift): the flight is refused",
+    "drift), or the vehicle has not stood still (0.02 m): the flight is refused",
 )  # fmt: skip
 START_REFUSED = EventDefinition(
     "start_refused",

@@ -287,6 +287,21 @@ def test_a_ready_flight_with_an_unsettled_estimate_or_a_lost_input_waits_again()
         assert after.waiting.tare_start_s is None
 
 
+@pytest.mark.parametrize("moved_m", [0.0, 0.1])
+def test_a_tare_during_which_the_vehicle_was_moved_begins_anew(moved_m: float) -> None:
+    begun, settled = ready(at_start(), tared_s=1.01), SettledEstimate()
+    for k in range(120, 0, -1):
+        there = at_start(-1.0 + (moved_m if k > 60 else 0.0))
+        assert there.vehicle is not None
+        settled = settled.take(NOW_S - 0.01 * k, there.vehicle, there.mocap)
+    waiting = in_stage(Stage.WAIT, 5.0, waiting=replace(begun.waiting, settled=settled), plan=None, course=None)
+    state, request = tick(waiting, inputs=at_start(), airborne=False)
+    assert list(request.tare) == [Tare.COLLECT, Tare.BEGIN if moved_m else Tare.FINISH]
+    assert state.stage is (Stage.WAIT if moved_m else Stage.OFFBOARD)
+    assert state.waiting.unready.startswith("the vehicle does not stand still") is (moved_m > 0.0)
+    assert state.waiting.tare_start_s == (NOW_S if moved_m else NOW_S - 1.01)
+
+
 @pytest.mark.parametrize(
     ("tared_s", "steps"), [(0.99, [Tare.COLLECT]), (1.01, [Tare.COLLECT, Tare.FINISH, Tare.BEGIN])]
 )
