@@ -190,6 +190,37 @@ def test_closing_the_arm_sets_current_torque_and_watchdog_to_0() -> None:
         assert (register(servo, 102, 2), register(servo, 64), register(servo, 98)) == (0, 0, 0)
 
 
+async def test_closing_the_arm_during_a_burst_of_noise_still_switches_the_torque_off() -> None:
+    servos, noise = new_servos(), [True] * 3
+    async with ServoBus(servos) as bus:
+        async with DynamixelArm(device_on(bus.path), arm_config(), flight_clock()) as arm:
+            await until(lambda: rewritten(arm, servos))
+            bus.damaged = lambda: bool(noise) and noise.pop()
+        assert not noise
+        assert [(register(servo, 64), register(servo, 98)) for servo in servos] == [(0, 0), (0, 0)]
+
+
+async def test_a_servo_that_does_not_hear_the_torque_off_keeps_its_watchdog() -> None:
+    async with flying_arm() as setup:
+        await until(lambda: rewritten(setup.arm, setup.servos))
+        servo = setup.servos[0]
+        answer = setup.bus.answer_to
+
+        def deaf_to_torque(data: bytes, baud_bps: int) -> tuple[bytes, float]:
+            """A loose plug: servo 11 misses the goal current 0 and the torque off, then it hears the bus again."""
+            servo.fail_silent(
+                b"\x83" + (102).to_bytes(2, "little") in data or data[4:10] == bytes((11, 6, 0, 3, 64, 0))
+            )
+            return answer(data, baud_bps)
+
+        setup.bus.answer_to = deaf_to_torque  # type: ignore[method-assign]
+        await setup.arm.__aexit__(None, None, None)
+        assert [(register(one, 64), register(one, 98)) for one in setup.servos] == [(1, 5), (0, 0)]
+        servo.update(1.0, servo.drive.angle_rad, 0.0)
+        servo.update(2.0, servo.drive.angle_rad, 0.0)
+        assert (register(servo, 98), register(servo, 102, 2)) == (0xFF, 0)
+
+
 async def test_leaving_a_dead_bus_is_quiet_and_ends() -> None:
     servos = new_servos()
     async with ServoBus(servos) as bus:

@@ -93,9 +93,11 @@ class ServoAccess:
         text = f"{register} reads {found.hex()} after {data.hex()} was written; another program may be using the bus"
         raise self.error(servo_id, text)
 
-    def try_write(self, servo_id: int, register: Register, value: int) -> None:
-        """Write a register once, whatever the servo answers."""
-        self._write_once(servo_id, register, value.to_bytes(register.size, "little", signed=register.signed))
+    def try_write(self, servo_id: int, register: Register, value: int) -> bool:
+        """Write a register once; return whether the servo has confirmed it."""
+        data = value.to_bytes(register.size, "little", signed=register.signed)
+        result, error = self._write_once(servo_id, register, data)
+        return result == COMM_SUCCESS and not error & ERROR_NUMBER
 
     def error(self, servo_id: int, text: str) -> DeviceError:
         """Return an error of one servo."""

@@ -33,6 +33,8 @@ _FLIGHT_REPLY_TIMEOUT_MS = 8.0
 """Reply timeout in flight, the longest delay caused by an absent servo."""
 _USB_LATENCY_MAX_MS = 4
 _LOOKS_FOR_JAWS = 2
+_TRIES = 3
+"""Attempts at a write that must not be lost, in flight and at its end: a disturbance often damages several packets in a row."""
 _ANSWER_BYTES = packets.STATUS_BYTES + dxl.BLOCK_SIZE
 
 Counts = tuple[int, ...]
@@ -214,16 +216,25 @@ class ArmBus:
         for servo_id in self._ids:
             self._servos.try_write(servo_id, dxl.BUS_WATCHDOG, self._watchdog)
 
+    def _confirmed(self, register: Register, value: int) -> list[int]:
+        """Write a register of all joints' servos, again if it is not confirmed; return the ids of those that have confirmed it."""
+        missing = self._ids
+        for _ in range(_TRIES):
+            missing = [servo_id for servo_id in missing if not self._servos.try_write(servo_id, register, value)]
+        return [servo_id for servo_id in self._ids if servo_id not in missing]
+
     def close(self) -> None:
-        """Set goal current 0, switch off torque and watchdog as far as the bus still works, and close the port. Never raises."""
+        """Set goal current 0, switch off torque and watchdog as far as the bus still works, and close the port. Never raises.
+
+        A servo that has not confirmed that its torque is off keeps its watchdog, which then stops it.
+        """
         self._port.reply_timeout_ms = _FLIGHT_REPLY_TIMEOUT_MS
         self._port.late_reply_ms = 0.0
         try:
             if self._touched and self._is_open() and self._port.is_open:
                 self.write_currents(self._limp)
-                for register in (dxl.TORQUE_ENABLE, dxl.BUS_WATCHDOG):
-                    for servo_id in self._ids:
-                        self._servos.try_write(servo_id, register, 0)
+                for servo_id in self._confirmed(dxl.TORQUE_ENABLE, 0):
+                    self._servos.try_write(servo_id, dxl.BUS_WATCHDOG, 0)
         except Exception:  # a lost port raises any exception of its driver; it must be closed all the same
             pass
         finally:
