@@ -175,6 +175,30 @@ async def test_tripped_watchdog_is_shown_and_started_again() -> None:
         await until(lambda: register(servo, 102, 2) != 0)
 
 
+@pytest.mark.parametrize(("losses", "temperature_c"), [(1, 0.0), (5, 30.0)], ids=["one write", "all attempts"])
+async def test_a_watchdog_whose_restart_is_lost_on_the_bus_is_restarted_all_the_same(
+    losses: int, temperature_c: float
+) -> None:
+    async with flying_arm() as setup:
+        servo, left = setup.servos[0], [True] * losses
+        servo.set_temperature_c(temperature_c)
+        answer = setup.bus.answer_to
+
+        def losing(data: bytes, baud_bps: int) -> tuple[bytes, float]:
+            if left and bytes((11, 6, 0, 3, 98, 0, 5)) in data:
+                left.pop()
+                return b"", 0.0
+            return answer(data, baud_bps)
+
+        setup.bus.answer_to = losing  # type: ignore[method-assign]
+        servo.update(1.0, shaft_rad(JOINTS[0], 1.0), 0.0)
+        servo.update(9.0, shaft_rad(JOINTS[0], 1.0), 0.0)
+        await asyncio.wait_for(state_when(setup.arm, lambda s: not left and s.read_failures == 0), DEADLINE_S)
+        await asyncio.wait_for(state_when(setup.arm, lambda s: s.hardware_error == (0, 0)), DEADLINE_S)
+        assert [register(s, 98) for s in setup.servos] == [5, 5]
+        await asyncio.wait_for(until(lambda: rewritten(setup.arm, setup.servos)), DEADLINE_S)
+
+
 def test_closing_the_arm_sets_current_torque_and_watchdog_to_0() -> None:
     async def main() -> list[ServoModel]:
         async with flying_arm() as setup:

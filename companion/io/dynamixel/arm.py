@@ -89,4 +89,5 @@ class DynamixelArm(ThreadedArm[tuple[Block, ...], Counts]):
 
 
 def _errors(block: Block) -> int:
-    return block.hardware_error | (WATCHDOG_ERROR if block.bus_watchdog == WATCHDOG_TRIPPED else 0)
+    to_restart = block.bus_watchdog == WATCHDOG_TRIPPED or block.is_unwatched
+    return block.hardware_error | (WATCHDOG_ERROR if to_restart else 0)

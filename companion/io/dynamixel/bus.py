@@ -168,10 +168,9 @@ class ArmBus:
             if error & ERROR_NUMBER:
                 return None
             block = Block.from_bytes(data)
-            if block.bus_watchdog not in (self._watchdog, dxl.WATCHDOG_TRIPPED):
-                return (
-                    None  # restarted by itself (a loose supply): its indirect addresses are lost, the block is invalid
-                )
+            # All zero after a restart by itself (a loose supply): its indirect addresses are lost, the block is invalid.
+            if block.bus_watchdog not in (self._watchdog, dxl.WATCHDOG_TRIPPED) and not block.is_unwatched:
+                return None
             blocks.append(block)
         if self.jaws is not None:
             self._read_jaws(self.jaws)
@@ -213,8 +212,7 @@ class ArmBus:
         for servo_id in self._ids:
             self._servos.try_write(servo_id, dxl.BUS_WATCHDOG, 0)
         self.write_currents(self._limp)
-        for servo_id in self._ids:
-            self._servos.try_write(servo_id, dxl.BUS_WATCHDOG, self._watchdog)
+        self._confirmed(dxl.BUS_WATCHDOG, self._watchdog)
 
     def _confirmed(self, register: Register, value: int) -> list[int]:
         """Write a register of all joints' servos, again if it is not confirmed; return the ids of those that have confirmed it."""

@@ -111,6 +111,11 @@ class Block:
         """Decode `BLOCK_SIZE` bytes of indirect data."""
         return Block(*_BLOCK.unpack(data))
 
+    @property
+    def is_unwatched(self) -> bool:
+        """Return whether the watchdog is off in a servo that has not restarted, whose block would be zero: its restart was lost."""
+        return self.bus_watchdog == 0 and self.temperature_c != 0
+
 
 @dataclass(frozen=True, slots=True)
 class JawsBlock:
