@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import os
+import tty
 
 import pytest
 
@@ -50,3 +52,15 @@ def test_a_servo_that_misses_every_packet_but_the_last_does_not_answer() -> None
         talk.open(BAUD)
         with pytest.raises(DeviceError, match="no answer at 3000000 baud"):
             talk.read(1, dxl.RETURN_DELAY)
+
+
+def test_a_port_that_goes_away_is_one_error_of_the_device() -> None:
+    far, near = os.openpty()
+    tty.setraw(near)
+    with ServoTalk(os.ttyname(near)) as talk:
+        talk.open(BAUD)
+        os.close(near)
+        os.close(far)
+        for attempt in (lambda: talk.ping(1), lambda: talk.read(1, dxl.MODEL), talk.answers_to_ping):
+            with pytest.raises(DeviceError, match="the port failed"):
+                attempt()

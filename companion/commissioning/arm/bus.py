@@ -6,6 +6,7 @@ Uses dynamixel-sdk on the flight's own port (`companion.io.dynamixel.port.ServoP
 from __future__ import annotations
 
 import contextlib
+import termios
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Self, get_args
@@ -116,6 +117,6 @@ class ServoTalk(ServoAccess):
         try:
             with super().exchange(doing):
                 yield
-        except (OSError, TypeError, ValueError) as error:
+        except (OSError, TypeError, ValueError, termios.error) as error:
             text = f"{doing}: the port failed: {error}; plug the adapter in again"
             raise DeviceError(f"{self._where}: {text}") from error
