@@ -55,7 +55,8 @@ class Joint(Model):
     zero_count: Annotated[int, Field(ge=-1048575, le=1048575)]
     """Present Position (register 132) at joint angle 0; of a motor that a plug-in drives, its angle in 1/4096 of a turn."""
     angle_deg: Span
-    """Lower and upper joint limit."""
+    """Lower and upper joint limit; with a Dynamixel servo, less than 360 deg apart, because it loses its turns when it is switched
+    off."""
     torque_max_nm: Positive
     """Largest commanded torque, at most the stall torque of the servo."""
     velocity_max_deg_s: Positive = Field(default_factory=_speed_of_servo_deg_s)
@@ -86,6 +87,10 @@ class Joint(Model):
                 problems.append((("torque_per_amp_nm_a",), "must be absent, because servo is null"))
             refuse("joint", problems)
             return self
+        low_deg, high_deg = self.angle_deg
+        if high_deg - low_deg >= 360.0:
+            text = f"expected less than 360 deg between the limits, got {high_deg - low_deg:g} deg: the servo loses its turns"
+            problems.append((("angle_deg",), f"{text} when it is switched off"))
         if self.torque_max_nm > kind.stall_torque_nm:
             text = f"the {kind.name} stalls at {kind.stall_torque_nm:g} N m, got {self.torque_max_nm:g} N m"
             problems.append((("torque_max_nm",), text))

@@ -17,6 +17,11 @@ NO_CONSTANT = "vehicle.arm.torque_per_amp_nm_a=null"
     ("overrides", "text"),
     [
         (("vehicle.arm.joints[0].torque_max_nm=3.1",), "the XM430-W210 stalls at 3 N m, got 3.1 N m"),
+        (
+            ("vehicle.arm.joints[0].angle_deg=[-180, 180]",),
+            "joints[0].angle_deg: expected less than 360 deg between the limits, got 360 deg: the servo loses its turns when it is "
+            "switched off",
+        ),
         (("vehicle.arm.joints[1].velocity_max_deg_s=571",), "the XM430-W210 turns at most at 570 deg/s, got 571 deg/s"),
         (
             ("vehicle.safety.joint_rate_max_deg_s=300",),

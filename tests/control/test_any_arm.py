@@ -37,7 +37,7 @@ FORCE_FULL = {"force_lowpass_hz": 1e6}
 def with_arm(count: int) -> Vehicle:
     """The shipped vehicle with an arm of rods that turn about y, x and z in turn."""
     given = load_flight(CATCH).vehicle.model_dump()
-    joint = given["arm"]["joints"][0] | {"angle_deg": (-180.0, 180.0), "torque_max_nm": 3.0}
+    joint = given["arm"]["joints"][0] | {"angle_deg": (-179.0, 179.0), "torque_max_nm": 3.0}
     arm = {
         "shoulder_body_m": (0.05, 0.01, -0.1),
         "link_lengths_m": [0.4 / max(1, count)] * count,

@@ -40,7 +40,7 @@ class ZeroJoint:
     servo_id: int
     sign: int
     zero_count: int
-    """Present position (register 132) at joint angle 0, within one turn unless the joint turns more than once."""
+    """Present position (register 132) at joint angle 0, within one turn."""
     spread_deg: float | None
     """Difference between the zeros of two poses; None if only one pose determines the zero."""
 
@@ -191,10 +191,7 @@ class ZeroGuide:
         last = at + turns.exact
         shown = list(zip(counts, self.steps, strict=True))[:last]
         zeros = [count - sign * step.pose_deg[joint] / _DEG_PER_COUNT for count, step in shown]
-        zero = round(sum(zeros) / len(zeros))
-        low_deg, high_deg = self._arm.joints[joint].angle_deg
-        if high_deg - low_deg < 360.0:
-            zero %= COUNTS_PER_TURN
+        zero = round(sum(zeros) / len(zeros)) % COUNTS_PER_TURN
         spread = (max(zeros) - min(zeros)) * _DEG_PER_COUNT if len(zeros) > 1 else None
         return ZeroJoint(self._arm.joints[servo].servo_id, sign, zero, spread)
 

@@ -70,12 +70,10 @@ def joint_scale(joint: Joint, torque_per_amp_nm_a: float, current_limit_counts: 
 def turn_offset_counts(joint: Joint, position_count: int) -> int:
     """Return the whole turns, in counts, to add to `zero_count` so that the joint angle lies within its limits, or 0 if none fits.
 
-    The encoder measures the angle within one turn; the servo loses the number of turns when it is switched off. A joint with less than
-    one turn between its limits is still unambiguous.
+    The encoder measures the angle within one turn; the servo loses the number of turns when it is switched off. The angle is still
+    unambiguous, because the vehicle file has less than one turn between the limits.
     """
     low_deg, high_deg = joint.angle_deg
-    if high_deg - low_deg >= 360.0:
-        return 0
     angle_deg = joint.sign * (position_count - joint.zero_count) * 360.0 / COUNTS_PER_TURN
     turns = math.ceil((low_deg - angle_deg) / 360.0)
     if angle_deg + 360.0 * turns > high_deg:
