@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -156,16 +156,77 @@ async def test_the_joints_go_on_while_the_clamp_is_silent_and_its_state_grows_ol
         assert arm.clamp() == old
 
 
-async def test_a_servo_that_has_lost_its_settings_gives_no_angle_but_is_still_commanded() -> None:
+@pytest.mark.parametrize("temperature_c", [0.0, 30.0])
+async def test_a_clamp_that_restarts_in_flight_gets_its_settings_and_its_turns_before_its_torque(
+    temperature_c: float,
+) -> None:
+    clamp = Clamp(start_deg=90.0 - 360.0)
+    clamp.servo.write(11, bytes((5,)))
+    clamp.servo.set_temperature_c(temperature_c)
+    clamp.servo.drive.turn_counts = -4096
+    async with on_bus(clamp) as (arm, _):
+        await taken(arm, clamp, ClampCommand.CLOSE, EMPTY_DEG)
+        await asyncio.wait_for(until(lambda: register(clamp.servo, 64) == 1), DEADLINE_S)
+        clamp.servo.reboot()
+        assert (register(clamp.servo, 64), register(clamp.servo, 102, 2)) == (0, 1750)
+        energised: list[int] = []
+        write = clamp.servo.write
+
+        def watched(address: int, data: bytes) -> None:
+            write(address, data)
+            if (address, data) == (64, b"\x01"):
+                energised.append(register(clamp.servo, 102, 2))
+
+        clamp.servo.write = watched  # type: ignore[method-assign]
+        at_deg = register(clamp.servo, 132, 4) * 360.0 / 4096
+        turns_deg = 360.0 * round((135.0 - at_deg) / 360.0)
+        goal = round((EMPTY_DEG - turns_deg) * 4096 / 360)
+        await asyncio.wait_for(state_after(arm, lambda: register(clamp.servo, 116, 4) == goal), DEADLINE_S)
+        assert register(clamp.servo, 64) == 1
+        assert energised and set(energised) == {400}
+        await seen_deg(arm, at_deg + turns_deg)
+
+
+async def test_a_restarted_clamp_without_a_command_is_seen_again_and_stays_limp() -> None:
     clamp = Clamp()
     async with on_bus(clamp) as (arm, _):
         clamp.servo.reboot()
         await arm.read(1.0)
         old = arm.clamp()
+        assert old is not None
+        await asyncio.wait_for(state_after(arm, lambda: arm.clamp() != old), DEADLINE_S)
+        assert (register(clamp.servo, 64), register(clamp.servo, 102, 2)) == (0, 400)
+
+
+async def test_a_silent_clamp_gets_no_torque() -> None:
+    """It may be starting: with its torque on before its settings it would hold with its largest current."""
+    clamp = Clamp()
+    async with (
+        ServoBus([*new_servos(), clamp.servo]) as bus,
+        DynamixelArm(device_on(bus.path), arm_config(), flight_clock(), CONFIG) as arm,
+    ):
+        clamp.servo.fail_silent(True)
+        for _ in range(3):
+            await arm.read(1.0)
+        sent: list[bytes] = []
+        answer = bus.answer_to
+
+        def noted(data: bytes, baud_bps: int) -> tuple[bytes, float]:
+            sent.append(data)
+            return answer(data, baud_bps)
+
+        bus.answer_to = noted  # type: ignore[method-assign]
+        arm.command_clamp(ClampCommand.CLOSE)
+        for _ in range(5):
+            await arm.read(1.0)
+        on = b"\x83" + bytes((64, 0, 1, 0, CONFIG.servo_id, 1))
+        assert sent and not any(on in data for data in sent)
+
+
+async def state_after(arm: DynamixelArm, condition: Callable[[], bool]) -> None:
+    """Read the joints until the condition holds."""
+    while not condition():
         await arm.read(1.0)
-        assert arm.clamp() == old
-        await taken(arm, clamp, ClampCommand.CLOSE, EMPTY_DEG)
-        assert register(clamp.servo, 64) == 1
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.access import ATTEMPTS, ERROR_NUMBER, ServoAccess
 from companion.io.dynamixel.jaws import JawsServo
 from companion.io.dynamixel.port import servo_port, usb_latency_ms
-from companion.io.dynamixel.registers import Block, JawsBlock, Register
+from companion.io.dynamixel.registers import Block, Register
 from companion.io.dynamixel.scale import RAD_PER_COUNT, JointScale, joint_scale, turn_offset_counts
 from companion.io.protocols import DeviceError
 from companion.io.reopening import Reopening
@@ -181,7 +181,7 @@ class ArmBus:
         answer = None
         for _ in range(_LOOKS_FOR_JAWS):
             answer = answer or packets.status_data(self._port.peek(_ANSWER_BYTES), jaws.servo_id, dxl.BLOCK_SIZE)
-        jaws.block = None if answer is None else JawsBlock.from_bytes(answer[0])
+        jaws.take(None if answer is None else answer[0])
 
     def command_jaws(self, command: ClampCommand) -> None:
         """Command the clamp; never waits.

@@ -129,7 +129,6 @@ class JawsBlock:
     hardware_error: int
 
     @staticmethod
-    def from_bytes(data: bytes) -> JawsBlock | None:
-        """Decode `BLOCK_SIZE` bytes of indirect data; None if all are zero: the servo has restarted and lost its addresses."""
-        block = JawsBlock(*_BLOCK.unpack(data))
-        return block if block.temperature_c else None
+    def from_bytes(data: bytes) -> JawsBlock:
+        """Decode `BLOCK_SIZE` bytes of indirect data."""
+        return JawsBlock(*_BLOCK.unpack(data))
