@@ -52,3 +52,14 @@ def test_a_servo_out_of_the_box_is_set_up_alone_and_its_id_is_that_of_a_joint(tm
         code, done = one.json("setup", "--yes", "--joint", "3")
         assert code == EXIT_OK, done
         assert settings(clamp) == (3, 3_000_000, 5, 0)
+
+
+def test_an_error_of_the_clamp_is_cleared_by_the_reboot(tmp_path: Path) -> None:
+    clamp = ServoModel(3, kind="XL330-M288")
+    joints = [ServoModel(joint.servo_id, kind=joint.kind.name) for joint in load_vehicle(FILE).arm.joints]
+    clamp.trip_overload()
+    with bench(tmp_path, *joints, clamp) as one:
+        code, found = one.json("reboot", "--yes")
+        assert code == EXIT_OK, found
+        assert found["servos"][-1] == {"name": "servo 3 (clamp)", "before": 0x20, "after": 0}
+    assert register(clamp, 70) == 0

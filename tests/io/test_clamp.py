@@ -223,6 +223,31 @@ async def test_a_silent_clamp_gets_no_torque() -> None:
         assert sent and not any(on in data for data in sent)
 
 
+async def test_a_hardware_error_of_the_clamp_is_reported_and_it_gets_no_torque() -> None:
+    clamp = Clamp()
+    async with on_bus(clamp) as (arm, _):
+        await taken(arm, clamp, ClampCommand.CLOSE, EMPTY_DEG)
+        await asyncio.wait_for(state_after(arm, lambda: register(clamp.servo, 64) == 1), DEADLINE_S)
+        assert arm.problem == ""
+        clamp.servo.trip_overload()
+        await asyncio.wait_for(state_after(arm, lambda: bool(arm.problem)), DEADLINE_S)
+        assert arm.problem.endswith("servo 13 (clamp): reports a hardware error: overload")
+        written: list[int] = []
+        write = clamp.servo.write
+
+        def watched(address: int, data: bytes) -> None:
+            written.append(address)
+            write(address, data)
+
+        clamp.servo.write = watched  # type: ignore[method-assign]
+        for _ in range(10):
+            await arm.read(1.0)
+        arm.command_clamp(ClampCommand.OPEN)
+        for _ in range(10):
+            await arm.read(1.0)
+        assert 64 not in written
+
+
 async def state_after(arm: DynamixelArm, condition: Callable[[], bool]) -> None:
     """Read the joints until the condition holds."""
     while not condition():

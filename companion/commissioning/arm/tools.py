@@ -14,7 +14,7 @@ from companion.commissioning.arm.drive import Driven, Leader, drive
 from companion.commissioning.arm.friction import Estimate, fit
 from companion.commissioning.arm.jog import ByKeys
 from companion.commissioning.arm.motion import LOAD_NM, SPEED_MAX_DEG_S, TORQUE_SHARE, limits_deg
-from companion.commissioning.arm.servo import Scan, joint_in, with_clamp
+from companion.commissioning.arm.servo import ClampJoint, Scan, joint_in, with_clamp
 from companion.commissioning.arm.sweep import Leg, Sample, Sweeper, duration_s, legs_of
 from companion.commissioning.arm.zero import ZeroGuide, ZeroResult
 from companion.commissioning.arm.zero_session import hold
@@ -185,16 +185,17 @@ def _value(estimate: Estimate | None, unit: str) -> str:
 
 
 def _reboot(session: Session) -> list[tuple[str, int, int]]:
-    """Reboot all servos; return name and hardware error before and afterwards of each."""
+    """Reboot all servos, the clamp's included; return name and hardware error before and afterwards of each."""
     if not session.confirm("the servos' torque goes off and the arm drops; reboot them?"):
         raise Cancelled("no servo was rebooted")
     device, errors = session.vehicle.arm_device, []
     with ServoTalk(device.servo_port) as talk:
         talk.open(device.baud)
-        for number, joint in enumerate(session.vehicle.arm.joints, 1):
+        for number, joint in enumerate(with_clamp(session.vehicle).joints, 1):
             before = talk.read(joint.servo_id, HARDWARE_ERROR)
             talk.reboot(joint.servo_id)
-            name = f"servo {joint.servo_id} (joint {number})"
+            part = "clamp" if isinstance(joint, ClampJoint) else f"joint {number}"
+            name = f"servo {joint.servo_id} ({part})"
             errors.append((name, before, talk.read(joint.servo_id, HARDWARE_ERROR)))
     return errors
 

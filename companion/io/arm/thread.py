@@ -82,7 +82,7 @@ class ThreadedArm(ABC, Generic[Answer, Goal]):
         self._failures = 0
         self._written_s: float | None = None
         self.problem = ""
-        """Newest error of the port; empty if it has not failed."""
+        """Newest error of the port or of the clamp's servo; empty if neither has failed."""
         self._servos: tuple[ServoReport, ...] = ()
         self._thread = DeviceThread("arm-bus", self._open, self._serve, self._close_bus, lambda: self._jobs.put(_STOP))
         self._loop: asyncio.AbstractEventLoop | None = None

@@ -52,9 +52,11 @@ class DynamixelArm(ThreadedArm[tuple[Block, ...], Counts]):
         self._servos = self._bus.reports
 
     def _read_bus(self) -> tuple[Block, ...] | None:
-        answer = self._bus.read()
-        if answer is not None and self._bus.jaws is not None and (angle_rad := self._bus.jaws.angle_rad) is not None:
-            self._clamp = ClampState(self._clock(), angle_rad)
+        answer, jaws = self._bus.read(), self._bus.jaws
+        if answer is not None and jaws is not None:
+            if (angle_rad := jaws.angle_rad) is not None:
+                self._clamp = ClampState(self._clock(), angle_rad)
+            self.problem = jaws.problem or self.problem
         return answer
 
     def _to_state(self, answer: tuple[Block, ...], asked_s: float) -> ArmState:

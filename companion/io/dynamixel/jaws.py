@@ -11,7 +11,7 @@ from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.access import ServoAccess
 from companion.io.dynamixel.registers import JawsBlock, Register
 from companion.io.dynamixel.scale import RAD_PER_COUNT
-from companion.model.servos import COUNTS_PER_TURN, SERVOS
+from companion.model.servos import COUNTS_PER_TURN, SERVOS, hardware_error_text
 from companion.model.team import ClampCommand
 
 
@@ -87,17 +87,31 @@ class JawsServo:
         )
 
     @property
+    def problem(self) -> str:
+        """Return the hardware error in the newest read; empty if there is none. The servo gets no torque then."""
+        if self.block is None or not self.block.hardware_error:
+            return ""
+        text = f"reports a hardware error: {hardware_error_text(self.block.hardware_error)}"
+        return str(self._servos.error(self.servo_id, text))
+
+    @property
     def pending(self) -> bool:
         """Return whether the newest read does not show the command, or not the settings."""
         if self._restarted:
             return True
         if self.command is None:
             return False
-        return self.block is None or not self.block.torque_on or self.block.goal_count != self._goal(self.command)
+        if self.block is None:
+            return True
+        if not self.block.torque_on:
+            return not self.block.hardware_error
+        return self.block.goal_count != self._goal(self.command)
 
     def send(self) -> None:
-        """Send the command, or the settings that a restart has lost; never waits. Torque is only sent to a servo that answers, first,
-        because it sets the goal to the present position.
+        """Send the command, or the settings that a restart has lost; never waits.
+
+        Torque is only sent to a servo that answers and reports no hardware error; it goes first, because it sets the goal to the
+        present position.
 
         Raises:
             OSError: the port is gone.
@@ -106,7 +120,7 @@ class JawsServo:
             self._write(self._indirect, int.from_bytes(self._addresses, "little"))
             self._write(dxl.GOAL_CURRENT, self._goal_current)
         elif self.command is not None:
-            if self.block is not None and not self.block.torque_on:
+            if self.block is not None and not self.block.torque_on and not self.block.hardware_error:
                 self._write(dxl.TORQUE_ENABLE, 1)
             self._write(dxl.GOAL_POSITION, self._goal(self.command))
 
