@@ -233,6 +233,47 @@ async def test_a_port_that_comes_back_under_its_name_is_read_again(tmp_path: Pat
                 assert edge.counts().lost is None
 
 
+class DeafToStart(ForceTorqueServer):
+    """Misses the first START."""
+
+    missed = False
+
+    def _execute(self, command: Command, parameter: int) -> None:
+        if command == Command.START and not self.missed:
+            self.missed = True
+        else:
+            super()._execute(command, parameter)
+
+
+async def test_a_start_that_is_lost_on_a_port_that_came_back_is_repeated(tmp_path: Path) -> None:
+    async with AsyncExitStack() as stack:
+        async with ForceTorqueServer() as server, world(server):
+            with plugged(tmp_path / "force", server.port) as port:
+                edge = await stack.enter_async_context(driver(port, 1.0))
+        await looked_at(edge, lambda sample: edge.counts().lost is not None)
+        async with DeafToStart() as server, world(server):
+            server.set_wrench((7.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            with plugged(tmp_path / "force", server.port):
+                await looked_at(edge, lambda sample: sample.force_sensor_n[0] == 7.0)
+                assert server.missed
+
+
+async def test_a_port_that_is_lost_again_while_the_sensor_starts_ends_that_start(tmp_path: Path) -> None:
+    async with AsyncExitStack() as stack:
+        async with ForceTorqueServer() as server, world(server):
+            with plugged(tmp_path / "force", server.port) as port:
+                edge = await stack.enter_async_context(driver(port))
+        await looked_at(edge, lambda sample: edge.counts().lost is not None)
+        async with ForceTorqueServer() as server:
+            server.silent = True
+            with plugged(tmp_path / "force", server.port):
+                await looked_at(edge, lambda sample: edge.counts().lost is None)
+                (starting,) = (task for task in asyncio.all_tasks() if "_start_again" in repr(task.get_coro()))
+        await looked_at(edge, lambda sample: edge.counts().lost is not None)
+        await asyncio.wait((starting,), timeout=5.0)
+        assert starting.cancelled()
+
+
 async def test_another_device_under_its_name_is_not_read_as_the_sensor(tmp_path: Path) -> None:
     async with AsyncExitStack() as stack:
         async with ForceTorqueServer() as server, world(server):

@@ -56,6 +56,7 @@ class RobotousForceTorque(SampleStream):
         self._reopening: Reopening[serial.Serial] | None = None
         """Attempts to open a lost port again; None while it is open."""
         self._starting: asyncio.Task[None] | None = None
+        """Start of the sensor on a port that was opened again."""
 
     def latest(self) -> ForceSample | None:
         """Return the newest raw sample; never blocks."""
@@ -178,7 +179,8 @@ class RobotousForceTorque(SampleStream):
                 if done:
                     return answer.result()
         finally:
-            del self._answers[command]
+            if self._answers.get(command) is answer:
+                del self._answers[command]
         raise DeviceError(
             f"{self._where}: {self._why_silent(f'no answer to command {command.value} ({command.name})')}"
         )
@@ -258,6 +260,8 @@ class RobotousForceTorque(SampleStream):
             return
         self._lost = f"the port was lost ({reason})"
         self._close_port()
+        if self._starting is not None:
+            self._starting.cancel()
         _LOG.error("%s: %s", self._where, self._lost)
         self._wake()
         self._reopening = Reopening("force reopening", self._open)
@@ -277,7 +281,9 @@ class RobotousForceTorque(SampleStream):
     async def _start_again(self) -> None:
         try:
             await self._start()
+            await self._first_samples()
         except DeviceError as error:
+            self._starting = None  # it is at its end
             self._lose(str(error))
 
     def _close_port(self) -> None:
