@@ -289,6 +289,10 @@ class Jaws(Model):
             least_deg = 4.0 * JAWS_TOLERANCE_DEG
             text = f"expected at least {least_deg:g} deg from closed_deg ({self.closed_deg:g} deg), got {self.open_deg:g} deg"
             refuse("jaws", [(("open_deg",), text)])
+        if abs(self.open_deg - self.empty_deg) >= 360.0:
+            most_deg = 360.0 - JAWS_BEYOND_DEG
+            text = f"expected less than {most_deg:g} deg from closed_deg ({self.closed_deg:g} deg), got {self.open_deg:g} deg"
+            refuse("jaws", [(("open_deg",), f"{text}: the servo loses its turns when it is switched off")])
         return self
 
 

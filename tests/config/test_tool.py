@@ -56,6 +56,15 @@ def test_a_clamp_has_a_servo_of_its_own_on_a_bus_of_dynamixel_servos(override: s
     assert [text for text in refused.value.lines if text.endswith(line)]
 
 
+def test_jaws_whose_servo_could_be_in_either_of_two_turns_are_refused() -> None:
+    with pytest.raises(ConfigError, match="expected less than 340 deg from closed_deg .180 deg., got -165 deg"):
+        load_flight(
+            "configs/missions/hover.yaml",
+            "configs/vehicles/tarot650_2r_clamp.yaml",
+            overrides=["vehicle.tool.jaws.open_deg=-165"],
+        )
+
+
 def test_the_rod_reaches_beyond_the_rotors_and_below_them() -> None:
     x_m, y_m, z_m = manipulator_of(ROD).net_body_m(PRESS)
     assert x_m >= ROD.airframe.radius_m + 0.25
