@@ -57,7 +57,7 @@ def test_a_clamp_has_a_servo_of_its_own_on_a_bus_of_dynamixel_servos(override: s
 
 
 def test_jaws_whose_servo_could_be_in_either_of_two_turns_are_refused() -> None:
-    with pytest.raises(ConfigError, match="expected less than 340 deg from closed_deg .180 deg., got -165 deg"):
+    with pytest.raises(ConfigError, match=r"expected less than 340 deg from closed_deg \(180 deg\), got -165 deg"):
         load_flight(
             "configs/missions/hover.yaml",
             "configs/vehicles/tarot650_2r_clamp.yaml",

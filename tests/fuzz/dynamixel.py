@@ -22,7 +22,7 @@ from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Endless, Target, Wrong, one_line
 from tests.io.arm_rig import JOINTS, arm_config
 
-WIDE = tuple(joint.model_copy(update={"angle_deg": (-180.0, 180.0)}) for joint in JOINTS)
+WIDE = tuple(joint.model_copy(update={"angle_deg": (-180.0, 179.95)}) for joint in JOINTS)
 """The joints of the arm, at any angle."""
 IDS = tuple(joint.servo_id for joint in WIDE)
 _WATCHDOG_MS = 100
