@@ -208,7 +208,9 @@ def test_a_pilot_who_takes_over_after_touch_down_is_not_disarmed() -> None:
     low = [f"{key}={value}" for key, value in LOW_HOVER.items()]
     result = FastFlight(load_sitl(HOVER, overrides=[*low, slow, taken])).run(limit_s=14.0)
     assert event_ids(result) == ["takeoff", "touchdown", "pilot_took_over"]
-    assert result.armed and not {o.request for o in result.outputs} & {
+    last = result.inputs[-1].status
+    assert last is not None and last.armed, "PX4 disarms when the pilot has landed"
+    assert not {o.request for o in result.outputs} & {
         AutopilotRequest.DISARM,
         AutopilotRequest.FORCE_DISARM,
     }
