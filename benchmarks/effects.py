@@ -32,7 +32,7 @@ EFFECTS = {
     "gusts": ("air",),
     "downwash": ("downwash",),
     "slack tether": ("tether_line",),
-    "IMU": ("imu",),
+    "IMU": ("imu", "barometer"),
     "motion capture": ("mocap", "markers"),
     "net": ("net",),
     "thrower": ("thrower",),
