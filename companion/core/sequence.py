@@ -47,7 +47,7 @@ _NONE: Final = AutopilotRequest.NONE
 
 
 def may_be_armed(status: AutopilotStatus | None, t_s: float, requested_s: float) -> bool:
-    """Return whether PX4 is armed, or may be since the last request to arm, at `requested_s`: no later HEARTBEAT denies it."""
+    """Return whether PX4 is armed, or may be: arming was requested at `requested_s`, and no later HEARTBEAT says that it is not."""
     if seq.is_armed(status):
         return True
     heard_s = -math.inf if status is None else status.heartbeat_stamp_s

@@ -287,7 +287,7 @@ class Launcher:
                 self._receive(channel)  # its last messages may have come after `select`
                 flight_open = False
             elif flight_open and guardian.took_over:
-                if now_s - guardian_open_s > GUARDIAN_EXIT_TIMEOUT_S:  # killed, and not even that ends it
+                if now_s - guardian_open_s > GUARDIAN_EXIT_TIMEOUT_S:  # SIGKILL has not ended it either
                     return
             elif flight_open and self._reports.begun and self._now_s() - heard_s > silent_max_s:
                 text = f"flight: the flight process sent nothing for {silent_max_s:g} s and was killed"

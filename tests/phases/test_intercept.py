@@ -548,7 +548,7 @@ def test_a_warning_ends_a_chase_and_says_why() -> None:
     assert flown.reports[-1] == ("ball_lost", "a rule has warned: no ball is met any more; stopping")
 
 
-def test_a_ball_that_comes_to_the_rotors_costs_few_looks_at_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_room_at_the_rotors_is_computed_a_few_times_a_tick_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
     looks, asked = [0], Intercept._clearance_m
 
     def counted(phase: Intercept, air: Air, s: Interception, path: list[ball.Point], plan: Any) -> float:

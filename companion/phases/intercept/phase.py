@@ -364,7 +364,7 @@ class Intercept(Phase):
         if not s.at_rotors:
             does = "moves aside" if room_m > max(kept_m, stop_m) + BETTER_M else "stops" if stop_m > kept_m else "stays"
             air.report(
-                BALL_AT_ROTORS, f"a ball comes {max(0.0, kept_m):.2f} m near the rotor disks; the vehicle {does}"
+                BALL_AT_ROTORS, f"a ball comes within {max(0.0, kept_m):.2f} m of the rotor disks; the vehicle {does}"
             )
             s = replace(s, at_rotors=True)
         if room_m > max(kept_m, stop_m) + BETTER_M:
