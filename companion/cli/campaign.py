@@ -16,12 +16,15 @@ from companion.campaigns.runner import Campaign, run
 from companion.cli.options import add_law, add_world, time_stamp
 from companion.config.document import ConfigError
 from companion.mission.check import check_mission
+from companion.mission.plan import Plan
 from companion.runtime.console import terminal_console
 from companion.sitl_config.loader import COMMAND_LINE_WORLD, SitlConfig, load_sitl
 
 PIPED_WIDTH = 132
 """Width of a table in columns if standard output is not a terminal."""
 CAMPAIGN_WIDTH = 168
+MISSION_MAX_S = 600.0
+"""Longest mission of a campaign: the fast loop keeps a flight in memory, 1.7 MB for each second."""
 
 
 def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | None = COMMAND_LINE_WORLD) -> None:
@@ -106,6 +109,10 @@ def checked(
     problems = check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases)
     if problems:
         raise ConfigError(problems)
+    duration_s = Plan.build(config.mission, config.vehicle).duration_s
+    if duration_s > MISSION_MAX_S:
+        text = f"expected a mission of at most {MISSION_MAX_S:g} s, got {duration_s:.0f} s; lower repeat, or fly it with companion fly"
+        raise ConfigError(f"{mission}: {text}")
     return config
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from companion.analysis import metrics
 from companion.analysis.log import Array, FlightLog
 from companion.config.loader import FlightConfig
+from companion.mission.plan import Plan
 from companion.model.outputs import Outputs, Sent
 from companion.model.types import Event, Inputs, Outcome, SafetyAction, Severity
 from companion.sitl_config.distributions import draw
@@ -23,6 +24,9 @@ from companion.sitl_config.world import World
 from sitl.campaigns.runner import Data
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
+
+LANDING_S = 70.0
+"""Largest time that a whole mission takes in addition to its plan."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,12 +63,17 @@ def laboratory_of(config: SitlConfig) -> Data:
     return {"world_seed": config.world.seed, "model_error": config.world.model_error}
 
 
-def fly_to_end(config: SitlConfig, limit_s: float = 90.0, until_mission_s: float = math.inf) -> Flown:
-    """Fly at most until world time `limit_s` and mission time `until_mission_s`; an exception is returned in `Flown.error`."""
+def limit_s(config: SitlConfig) -> float:
+    """Return the world time at which a flight that has not ended is lost."""
+    return Plan.build(config.mission, config.vehicle).duration_s + LANDING_S
+
+
+def fly_to_end(config: SitlConfig, until_mission_s: float = math.inf) -> Flown:
+    """Fly at most until mission time `until_mission_s`; an exception is returned in `Flown.error`."""
     gc.collect()  # what is left of the flight before: the collector itself comes to the oldest objects after hundreds of flights only
     try:
         fast = FastFlight(config)
-        return Flown(fast.config, fast, fast.run(limit_s, until_mission_s), None)
+        return Flown(fast.config, fast, fast.run(limit_s(config), until_mission_s), None)
     except Exception as error:
         return Flown(config, None, FastResult(), f"{type(error).__name__}: {error}")
 

@@ -13,7 +13,7 @@ import numpy as np
 from companion.model.types import Outcome, SafetyAction
 from companion.sitl_config.loader import SitlConfig
 from companion.sitl_config.team import SEED_APART, TeamConfig
-from sitl.campaigns.flights import laboratory_of, with_world
+from sitl.campaigns.flights import laboratory_of, limit_s, with_world
 from sitl.campaigns.runner import Data
 from sitl.fast.result import FastResult
 from sitl.fast.team import FastTeam, TeamResult
@@ -46,7 +46,7 @@ def fly(config: SitlConfig, flight: Data) -> Data:
     report: Data = {}
     try:
         team = FastTeam(TeamConfig("", "", left, right))
-        result = team.run()
+        result = team.run(limit_s(left))
         assert result.truth is not None
         report = result.truth.report()
     except Exception as failure:

@@ -1,8 +1,7 @@
 """Flies the flights of `companion tune`.
 
-A flight is {controller, world, until_mission_s, limit_s}: the settings of its control law, the keys of the world in which it differs
-from the configuration, the time on the mission's clock at which it is cut short (null for the whole mission), and the world time at
-which a flight that has not ended is lost.
+A flight is {controller, world, until_mission_s}: the settings of its control law, the keys of the world in which it differs from the
+configuration, and the time on the mission's clock at which it is cut short (null for the whole mission).
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ def fly(config: SitlConfig, flight: Data) -> Data:
     given, until_s = flight["controller"], flight["until_mission_s"]
     controller = LAWS[given["law"]].model_validate_json(json.dumps(given))
     config = with_world(config.model_copy(update={"controller": controller}), flight["world"])
-    flown = fly_to_end(config, flight["limit_s"], math.inf if until_s is None else until_s)
+    flown = fly_to_end(config, math.inf if until_s is None else until_s)
     return {"row": graded(flown, cut=until_s is not None)}
 
 

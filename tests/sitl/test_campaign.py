@@ -25,7 +25,8 @@ from msgspec.structs import replace
 from companion.analysis import metrics
 from companion.campaigns.process import CampaignError, CampaignProcess
 from companion.campaigns.robustness.cases import read_cases
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK
+from companion.mission.plan import Plan
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
 from companion.model.types import Outcome, PhaseKind
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns import compare, faults, flights, robustness, runner
@@ -78,6 +79,27 @@ def seen() -> Seen:
         patched.setattr(compare, "fly_to_end", fly_to_end)
         made = compare.fly(CONFIG, FLIGHT)
     return Seen(made, flown[0])
+
+
+def test_a_flight_has_time_to_end_however_long_its_mission_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[float] = []
+
+    def run(_: FastFlight, limit_s: float, until_mission_s: float) -> FastResult:
+        given.append(limit_s)
+        return FastResult()
+
+    monkeypatch.setattr(FastFlight, "run", run)
+    config = load_sitl("probe")
+    flights.fly_to_end(config)
+    assert given[0] - 60.0 > Plan.build(config.mission, config.vehicle).duration_s > 90.0
+
+
+def test_a_mission_that_no_computer_could_keep_in_memory_is_refused() -> None:
+    ended = run_here("compare", "--mission", "soak", "--seeds", "1")
+    assert ended.code == EXIT_BAD_INPUT
+    assert ended.err_lines == [
+        "soak: expected a mission of at most 600 s, got 3607 s; lower repeat, or fly it with companion fly"
+    ]
 
 
 def test_a_row_is_what_the_flight_was(seen: Seen) -> None:

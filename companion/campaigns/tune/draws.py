@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from companion.campaigns.robustness.campaign import world_key
-from companion.config.mission import Mission
+from companion.config.mission import Catch, Mission
 from companion.config.vehicle import Vehicle
 from companion.mission.plan import Plan
 from companion.model.types import PhaseKind
@@ -25,8 +25,6 @@ AFTER_CATCH_S = 5.0
 """Time after the expected catch at which a flight of the search ends."""
 WITHOUT_CATCH_S = 20.0
 """Duration of a flight of the search whose mission expects no payload, from the start of the take-off."""
-LANDING_S = 70.0
-"""Largest time that a whole mission takes in addition to its plan."""
 _STEP_S, _BESIDE_M = 0.05, 0.02
 
 
@@ -39,8 +37,6 @@ class Draws:
     count: int
     until_mission_s: float | None
     """Time on the mission's clock at which their flights end; None for whole missions."""
-    limit_s: float
-    """World time at which a flight that has not ended is lost."""
     payload_max_kg: float | None
     """Largest payload; None if the mission expects none."""
     fixed: frozenset[str]
@@ -64,7 +60,6 @@ class Draws:
             "controller": settings,
             "world": {key: value for key, value in world.items() if key not in self.fixed},
             "until_mission_s": self.until_mission_s,
-            "limit_s": self.limit_s,
         }
 
     @property
@@ -80,24 +75,18 @@ def draws_of(
     plan = Plan.build(mission, vehicle)
     payload_kg = mission.catch.payload_max_kg if mission.catch is not None else None
     fixed = frozenset(key for override in overrides if (key := world_key(override)))
-    limit_s = plan.duration_s + LANDING_S
-    until_s: float | None = min(_catch_s(plan, mission) + AFTER_CATCH_S, plan.duration_s)
-    if payload_kg is None:
-        until_s = WITHOUT_CATCH_S
-    if until_s is None or until_s >= plan.duration_s:
-        until_s = None
+    until_s = WITHOUT_CATCH_S if mission.catch is None else _catch_s(plan, mission.catch) + AFTER_CATCH_S
+    cut_s = until_s if until_s < plan.duration_s else None
     return (
-        Draws(TRAINING_FROM + APART * seed, training, until_s, limit_s, payload_kg, fixed),
-        Draws(HELD_OUT_FROM + APART * seed, held_out, None, limit_s, payload_kg, fixed),
+        Draws(TRAINING_FROM + APART * seed, training, cut_s, payload_kg, fixed),
+        Draws(HELD_OUT_FROM + APART * seed, held_out, None, payload_kg, fixed),
     )
 
 
-def _catch_s(plan: Plan, mission: Mission) -> float:
+def _catch_s(plan: Plan, catch: Catch) -> float:
     """Return the time on the mission's clock at which the vehicle first passes the place of the expected catch."""
-    if mission.catch is None:
-        return math.inf
     times = [n * _STEP_S for n in range(int(plan.duration_s / _STEP_S))]
     flown = [t_s for t_s in times if plan.segment(t_s).kind is PhaseKind.FLIGHT] or times
-    away_m = [math.dist(plan.reference(t_s).position_world_m[:2], mission.catch.expected_at_m) for t_s in flown]
+    away_m = [math.dist(plan.reference(t_s).position_world_m[:2], catch.expected_at_m) for t_s in flown]
     nearest_m = min(away_m)
     return next(t_s for t_s, m in zip(flown, away_m, strict=True) if m <= nearest_m + _BESIDE_M)
