@@ -12,9 +12,8 @@ from typing import Any
 from companion.commissioning.yaml_edit import EditError, edited
 from companion.config.base import Location
 from companion.config.document import ConfigError, Data, Document, Origin, key_path, problem_lines
-from companion.config.explain import validate
-from companion.config.vehicle import Vehicle
-from companion.config.yaml_strict import parse_value, read_document
+from companion.config.loader import vehicle_of
+from companion.config.yaml_strict import parse_document, read_document
 from companion.runtime.files import write_whole
 
 _BOM = "\ufeff"
@@ -136,14 +135,12 @@ def _same(old: Data, new: Data) -> bool:
 
 
 def _check(shown: str, text: str, changes: tuple[Change, ...]) -> None:
-    data = parse_value(text, Origin(shown))
-    assert isinstance(data, dict)
-    document = Document(shown, data)
+    document, lines = parse_document(text, shown), list[str]()
     for change in changes:
         if not _same(document.get(change.location), change.new):
             raise ConfigError(f"{shown}: {change.key} cannot be changed by this tool; write it by hand: {change.new}")
-    if validate(Vehicle, document) is None:
-        raise ConfigError([f"{line} (after the proposed change)" for line in problem_lines(document.problems)])
+    if vehicle_of(document, lines) is None:
+        raise ConfigError([f"{line} (after the proposed change)" for line in lines])
 
 
 def _back_up(path: Path, data: bytes) -> Path:

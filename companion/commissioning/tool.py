@@ -159,11 +159,9 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
     except Cancelled as end:
         print_error(f"companion {tool.name}: {end}")
         return EXIT_ABORTED
-    vehicle_path = named_file("vehicles", arguments.vehicle, "--vehicle")
-    patch = propose(vehicle_path, report.changes) if report.changes else None
-    written = str(patch.write()) if patch and _may_write(session, tool.family, patch) else None
+    patch, written, problem = _change_file(session, tool.family, report.changes)
     settled = not patch or (written is not None and tool.family.ok_when_written)
-    ok = settled and (not refusals(report.rows) if report.ok is None else report.ok)
+    ok = problem is None and settled and (not refusals(report.rows) if report.ok is None else report.ok)
     if arguments.json:
         document = {
             "schema_version": SCHEMA_VERSION,
@@ -181,10 +179,25 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
             *report.text,
             *row_lines(report.rows, report.brief),
             *report.advice,
-            *_patch_lines(patch, written),
+            *_patch_lines(patch, written, problem),
         ):
             print(line)
+    if problem is not None:
+        raise problem  # after what was measured, which would be lost
     return EXIT_OK if ok else EXIT_REFUSED
+
+
+def _change_file(
+    session: Session, family: Family, changes: Mapping[Location, Data]
+) -> tuple[Patch | None, str | None, ConfigError | None]:
+    """Return the proposed change, the backup if it is written, and why it cannot be proposed or written."""
+    patch = None
+    try:
+        if changes:
+            patch = propose(named_file("vehicles", session.arguments.vehicle, "--vehicle"), changes)
+        return patch, str(patch.write()) if patch and _may_write(session, family, patch) else None, None
+    except ConfigError as error:
+        return patch, None, error
 
 
 def _may_write(session: Session, family: Family, patch: Patch) -> bool:
@@ -217,15 +230,11 @@ def row_lines(rows: Sequence[Row], brief: Mapping[str, str]) -> list[str]:
     return lines
 
 
-def _patch_lines(patch: Patch | None, written: str | None) -> list[str]:
+def _patch_lines(patch: Patch | None, written: str | None, problem: ConfigError | None) -> list[str]:
     if not patch:
         return []
-    return [
-        "",
-        patch.text,
-        "",
-        f"written; the old file is kept as {written}" if written else "not written; add --write to write it",
-    ]
+    how = f"written; the old file is kept as {written}" if written else "not written; add --write to write it"
+    return ["", patch.text, *(["", how] if problem is None else [])]
 
 
 def add_tool(

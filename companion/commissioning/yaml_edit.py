@@ -10,7 +10,7 @@ import yaml
 
 from companion.config.base import Location
 from companion.config.document import Data, key_path
-from companion.config.yaml_strict import StrictLoader
+from companion.config.yaml_strict import composed
 from companion.config.yaml_text import flow_text
 
 
@@ -44,11 +44,7 @@ def edited(text: str, changes: Mapping[Location, Data]) -> str:
 
 
 def _edited(text: str, location: Location, value: Data) -> str:
-    loader = StrictLoader(text)
-    try:
-        node: yaml.Node | None = loader.get_single_node()
-    finally:
-        loader.dispose()
+    node = composed(text)
     if not isinstance(node, yaml.MappingNode):
         raise EditError("expected a mapping (key: value) at the top level")
     found: yaml.Node = node

@@ -98,7 +98,8 @@ def load_flight(
     vehicle: Vehicle | None = None
     vehicle_file = _open_named(mission_file, ("vehicle",), vehicle_path, of_vehicle)
     if vehicle_file is not None:
-        vehicle = _check_vehicle(vehicle_file, parsed, of_vehicle)
+        _override(vehicle_file, "vehicle", parsed, of_vehicle)
+        vehicle = vehicle_of(vehicle_file, of_vehicle)
         if hardware and vehicle is not None:
             of_vehicle += missing_on_hardware(vehicle, vehicle_file) + unusable_devices(vehicle, vehicle_file)
     _place_arm(mission_file, vehicle)
@@ -146,7 +147,8 @@ def load_vehicle(path: str | Path, overrides: Sequence[str] = ()) -> Vehicle:
     """
     lines: list[str] = []
     document = read_document(named_file("vehicles", path, "--vehicle"))
-    vehicle = _check_vehicle(document, parse_overrides(overrides), lines)
+    _override(document, "vehicle", parse_overrides(overrides), lines)
+    vehicle = vehicle_of(document, lines)
     if vehicle is not None:
         lines += unusable_devices(vehicle, document)
     if vehicle is None or lines:
@@ -170,9 +172,8 @@ def logged_flight(config_json: str) -> FlightConfig:
     return FlightConfig.model_validate_json(json.dumps(data))
 
 
-def _check_vehicle(document: Document, overrides: list[Override], lines: list[str]) -> Vehicle | None:
-    """Apply the overrides to a vehicle file and validate it; return None if it has problems."""
-    _override(document, "vehicle", overrides, lines)
+def vehicle_of(document: Document, lines: list[str]) -> Vehicle | None:
+    """Return the vehicle of a vehicle file; if it has problems, add one line for each of them and return None."""
     _move_keys(document)
     if document.data.get("arm", NO_ARM) is None:
         document.replace(("arm",), copy.deepcopy(NO_ARM), document.origin(("arm",)))

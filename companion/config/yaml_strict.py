@@ -107,6 +107,15 @@ def read_document(path: str | Path, shown_as: str | None = None) -> Document:
         raise ConfigError(
             f"{shown}:{line}: not UTF-8 (byte 0x{raw[error.start]:02x}); save the file as UTF-8"
         ) from None
+    return parse_document(text, shown)
+
+
+def parse_document(text: str, shown: str) -> Document:
+    """Parse the text of a file whose top level is a mapping.
+
+    Raises:
+        ConfigError: as `read_document`.
+    """
     document = Document(shown, {})
     data = _parse(text, document, None)
     if data is None:
@@ -146,7 +155,7 @@ def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
         mark = yaml.Mark("", start, text.count("\n", 0, start), start - text.rfind("\n", 0, start) - 1, None, 0)
         raise ConfigError(f"{origin(mark)}: not YAML: {name} (U+{ord(strange[1]):04X}); write an ordinary space")
     try:
-        node = _composed(text)
+        node = composed(text)
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
         at = fixed or Origin(document.source, before.count("\n") + 1, error.position - (before.rfind("\n") + 1) + 1)
@@ -158,7 +167,7 @@ def _parse(text: str, document: Document, fixed: Origin | None) -> Data:
 
 
 @functools.lru_cache(maxsize=16)
-def _composed(text: str) -> yaml.Node | None:
+def composed(text: str) -> yaml.Node | None:
     """Return the root node of the text, None if it is empty. A campaign reads the same few files for each of its cases.
 
     Raises:

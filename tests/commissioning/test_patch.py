@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from companion.cli.main import make_parser
+from companion.commissioning import patch
 from companion.commissioning.patch import propose
-from companion.commissioning.tool import ARM, SENSORS, Session
+from companion.commissioning.tool import ARM, SENSORS, Report, Session, Tool, run_tool
 from companion.commissioning.yaml_edit import edited
 from companion.config.document import ConfigError, Data, Origin
 from companion.config.loader import load_vehicle
@@ -92,6 +98,48 @@ def test_a_patch_that_makes_the_file_invalid_is_refused(
     assert words in str(caught.value) and str(mine) in str(caught.value)
     assert len(caught.value.lines) == 1
     assert mine.read_bytes() == before and list(mine.parent.iterdir()) == [mine]
+
+
+def without_arm(text: str) -> str:
+    """Return the vehicle file without arm, tool and force sensor."""
+    data = yaml.safe_load(text)
+    devices = {**data["devices"], "arm": None, "force": None}
+    return yaml.safe_dump({**data, "arm": None, "tool": None, "devices": devices})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        without_arm,
+        lambda text: text.replace("tether:\n", "tether:\n  react_time_s: 0.3\n", 1),
+        lambda text: f"# a\u2028b\u0085c: [\n{text}",
+    ],
+    ids=["without an arm", "with a key of version 0.1.0", "with a line separator of YAML 1.1 in a comment"],
+)
+def test_every_file_that_can_be_loaded_can_be_changed(mine: Path, change: Callable[[str], str]) -> None:
+    mine.write_text(change(mine.read_text(encoding="utf-8")), encoding="utf-8")
+    load_vehicle(mine)
+    propose(mine, {("devices", "mocap", "rigid_body_id"): 7}).write()
+    assert load_vehicle(mine).devices.mocap.rigid_body_id == 7
+
+
+@pytest.mark.parametrize(
+    ("value", "told"), [(7, "cannot be written: Read-only file system"), (-1, "(after the proposed change)")]
+)
+def test_what_was_measured_is_printed_even_if_the_file_cannot_be_changed(
+    mine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], value: int, told: str
+) -> None:
+    def write_whole(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(patch, "write_whole", write_whole)
+    report = Report(text=["measured"], changes={("devices", "mocap", "rigid_body_id"): value})
+    arguments = make_parser().parse_args(["mocap", "check", "--vehicle", str(mine), "--write", "--yes"])
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        run_tool(Tool("mocap check", SENSORS, lambda _: None, lambda *_: report), arguments)
+    printed = capsys.readouterr().out
+    assert printed.startswith("measured\n") and "add --write" not in printed
+    assert ("+    rigid_body_id: 7" in printed) is (value == 7)
 
 
 def test_a_file_that_was_changed_meanwhile_is_not_written(mine: Path) -> None:
