@@ -9,7 +9,7 @@ from typing import Any
 from companion.campaigns.pair import PairRobustness
 from companion.campaigns.robustness.campaign import Robustness
 from companion.campaigns.robustness.cases import Case, Cases, read_cases
-from companion.cli.campaign import add_options, add_plan, checked, common, count, fly
+from companion.cli.campaign import add_options, add_plan, checked, common, count, fly, why_unusable
 from companion.cli.options import MISSION_OR_DEFAULT_HELP
 from companion.config.document import ConfigError
 from companion.config.shipped import DEFAULT_MISSION, names
@@ -113,9 +113,14 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
     arguments.overrides = [*(kept.overrides if kept is not None else ()), *arguments.overrides]
     # A case contains its whole world.
     world = arguments.world or ("robustness" if kept is None else "ideal")
+    config = checked(mission, vehicle, law, preset, arguments.overrides, world=world)
+    if law is None and config.mission.controller.file is not None:
+        law = config.sources.controller
+    if arguments.keep is not None:
+        _check_keep(arguments)
     numbers = range(arguments.first, arguments.first + arguments.draws)
     return Robustness(
-        configs=[checked(mission, vehicle, law, preset, arguments.overrides, world=world)],
+        configs=[config],
         flights=[{"variant": 0, "name": case.name, "number": None, "world": case.knobs()} for case in cases]
         or [{"variant": 0, "name": f"draw {n}", "number": n, "world": None} for n in numbers],
         **common(arguments),
@@ -127,3 +132,14 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
         vehicle=vehicle,
         controller=law,
     )
+
+
+def _check_keep(arguments: argparse.Namespace) -> None:
+    """Raise ConfigError if `--keep` cannot be written, or replaces cases that are not flown."""
+    keep = Path(arguments.keep)
+    updates = arguments.cases is not None and not arguments.case and keep.resolve() == Path(arguments.cases).resolve()
+    problem = why_unusable(keep.parent, None)
+    if keep.exists() and not updates:
+        problem = "exists; expected the name of a new file, or that of --cases without --case"
+    if problem is not None:
+        raise ConfigError(f"companion robustness: --keep {keep}: {problem}")

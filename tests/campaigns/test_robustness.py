@@ -31,6 +31,11 @@ def test_the_worst_are_those_that_crashed_then_gave_up_then_were_off() -> None:
     assert [one["number"] for one in worst(rows, 5)] == [3, 4, 1, 2, 5]
 
 
+def test_flights_with_one_payload_are_counted_once() -> None:
+    [part] = thirds([row(number, 0.02, payload_kg=0.2) for number in range(4)])
+    assert (part.payload_kg, part.flights, part.caught) == ((0.2, 0.2), 4, 4)
+
+
 def test_cases_come_back_from_their_file_as_they_were(tmp_path: Path) -> None:
     rows = [
         row(0, 0.0423),

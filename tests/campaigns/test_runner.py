@@ -14,7 +14,9 @@ from typing import Any
 import pytest
 
 from companion.campaigns.process import CampaignError
+from companion.campaigns.robustness.cases import read_cases
 from companion.campaigns.runner import flat
+from companion.config.controller import preset_file
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
 from tests.campaigns.made_up import compare_row, draw_row, fault_row, fly_made_up
 from tests.support import CATCH, HOVER, run_here
@@ -191,6 +193,42 @@ def test_draws_are_written_as_table_and_cases_and_a_crash_is_exit_code_5(monkeyp
     assert "1 flights crashed or were lost." in page.text
     summary = json.loads(Path("out/robustness.json").read_text())["summary"]
     assert summary["thirds"][0]["flights"] == 4 and set(summary["thirds"][0]["e_p_m"]) == {"p50", "p95", "max"}
+
+
+def test_the_controller_file_of_a_mission_is_named_where_its_flights_are_to_be_flown_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    gains = preset_file("psc", "tuned").read_text(encoding="utf-8")
+    Path("mine.yaml").write_text(gains.replace("preset: tuned", "preset: mine"), encoding="utf-8")
+    text = CATCH.read_text(encoding="utf-8").replace("{law: adaptive, preset: recommended}", "{file: mine.yaml}")
+    text = re.sub("(?m)^vehicle: .*", "vehicle: tarot650_2r", text)
+    Path("catch.yaml").write_text(text, encoding="utf-8")
+    fly_made_up(monkeypatch, lambda flight: draw_row(flight["number"] or 0, 0.02))
+    ended = run_here("robustness", "catch.yaml", "--draws", "1", "--out", "out")
+    assert "companion fly catch.yaml --sitl --controller mine.yaml --preset mine" in ended.out
+    assert run_here("robustness", "--cases", "out/worst.yaml", "--plan").code == EXIT_OK
+
+
+def test_a_file_of_cases_loses_none_that_was_not_flown(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = {"draw 0": 0.02, "draw 1": 0.03, "draw_0": 0.01, "draw_1": None}
+
+    def row(flight: dict[str, Any]) -> dict[str, Any] | None:
+        error_m, number = results[flight["name"]], int(flight["name"][-1])
+        found = draw_row(number, error_m)
+        return None if error_m is None else {**found, "name": flight["name"], "number": flight["number"]}
+
+    fly_made_up(monkeypatch, row)
+    assert run_here("robustness", str(CATCH), "--draws", "2", "--out", "a", "--keep", "kept.yaml").code == EXIT_OK
+    before = Path("kept.yaml").read_text(encoding="utf-8")
+    again = ("--cases", "kept.yaml", "--keep", "kept.yaml")
+    for words in ((str(CATCH), "--keep", "kept.yaml"), (*again, "--case", "draw_0"), ("--keep", "a/draws.csv/k.yaml")):
+        refused = run_here("robustness", *words)
+        assert refused.code == EXIT_BAD_INPUT and "--keep" in refused.err_lines[0] and len(refused.err_lines) == 1
+    assert run_here("robustness", *again, "--out", "b").code == EXIT_ABORTED
+    assert Path("kept.yaml").read_text(encoding="utf-8") == before
+    results["draw_1"] = 0.02
+    assert run_here("robustness", *again, "--out", "c").code == EXIT_OK
+    assert [case.kept.e_p_m for case in read_cases(Path("kept.yaml")).cases] == [0.02, 0.01]
 
 
 CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"

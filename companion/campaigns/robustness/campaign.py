@@ -108,7 +108,8 @@ class Robustness(Campaign):
     def write_extra_files(self, rows: Sequence[Row], out: Path) -> None:
         """Write the worst flights to `worst.yaml`, and the flights to keep to the file of `--keep`, as cases."""
         self._write_cases(worst(rows), out / "worst.yaml")
-        if self.keep is not None:
+        # Only the file of `--cases` can exist already: cases that were not flown must not leave it.
+        if self.keep is not None and (len(rows) == len(self.flights) or not Path(self.keep).exists()):
             self._write_cases(rows if self.cases else worst(rows), Path(self.keep))
 
     def show(self, rows: Sequence[Row], console: Console) -> None:

@@ -15,6 +15,7 @@ from companion.config.explain import validate
 from companion.config.yaml_strict import read_document
 from companion.config.yaml_text import flow_text
 from companion.model.types import Outcome
+from companion.runtime.files import write_whole
 from companion.sitl_config.world import World
 
 WORSE_THAN_KEPT = 1.25
@@ -96,7 +97,7 @@ def write_cases(cases: Cases, path: Path, remark: str) -> None:
         lines += ["", f"  - name: {flow_text(case.name)}", "    world:"]
         lines += [f"      {key}: {flow_text(value)}" for key, value in case.knobs().items()]
         lines.append(f"    kept: {flow_text(case.kept.model_dump(mode='json', exclude_none=True))}")
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_whole(path, ("\n".join(lines) + "\n").encode())
 
 
 def fly_command(

@@ -97,11 +97,13 @@ class Third:
 
 
 def thirds(rows: Sequence[Row]) -> list[Third]:
-    """Return the flights of each third of the payload range; the thirds have equal widths."""
+    """Return the flights of each third of the payload range; the thirds have equal widths. One payload for all is one part."""
     payloads = [row["world"]["payload_kg"] for row in rows if "payload_kg" in row["world"]]
     if not payloads:
         return []
     edges = [float(edge) for edge in np.linspace(min(payloads), max(payloads), 4)]
+    if edges[0] == edges[-1]:  # set by the user, or a single flight
+        edges = edges[:2]
     found = []
     for low, high in itertools.pairwise(edges):
         last = high == edges[-1]
