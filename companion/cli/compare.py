@@ -99,8 +99,16 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
         for key, option in _OPTIONS.items():
             if override.partition("=")[0].strip() == key:
                 raise ConfigError(f"companion compare: --set {key}: the grid sets this key; use {option}")
-    files = [name for name in arguments.controllers if is_controller_file(name)]
+    files = list(dict.fromkeys(name for name in arguments.controllers if is_controller_file(name)))
     laws = [name for name in arguments.controllers if name not in files]
+    if files and not laws:
+        given = {
+            "--presets": arguments.presets,
+            "--ablation": arguments.ablation,
+            "--adaptation": "off" in arguments.adaptation,
+        }
+        for option in (option for option, value in given.items() if value):
+            raise ConfigError(f"companion compare: {option}: expected a control law in --controllers, got files only")
     variants = [Variant(file, preset := preset_of_file(file), preset) for file in files]
     try:
         if laws or not files:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from companion.campaigns.compare.aggregate import Spread, adaptation_pairs, aggregate, pairs_with_reference
+from companion.campaigns.compare.aggregate import Pairs, Spread, adaptation_pairs, aggregate, pairs_with_reference
 from companion.campaigns.compare.grid import ABLATED, ABLATIONS, flights_of, variants_of
 from companion.campaigns.compare.tables import compliance_table, difference_text, print_tables
 from companion.campaigns.runner import Row
@@ -163,6 +163,12 @@ def test_laws_are_compared_in_the_same_laboratories_with_a_confidence_interval()
     assert difference_text(pairs) == "-1.0 (-4.0 to +3.0)"
     (few,) = pairs_with_reference(aggregate([*other[:5], *base])).values()
     assert (few.difference_95, difference_text(few)) == (None, "")
+
+
+def test_ten_thousand_laboratories_have_a_confidence_interval_too() -> None:
+    pairs = Pairs(aggregate([row(1, 0.1)])[0], [(1.0, 0.001 * n) for n in range(10_000)])
+    assert pairs.difference_95 == pytest.approx((3.999, 3.901, 4.098), abs=1e-9)  # ranks 4902 and 5099: 1.96 sigma
+    assert pairs.p_value == 0.0
 
 
 @pytest.mark.parametrize("columns", [70, 200])

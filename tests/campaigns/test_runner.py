@@ -239,6 +239,8 @@ CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
     [
         (("compare", "--controllers", "foo"), r"^companion compare: --controllers foo: no such controller; available: adaptive"),
         (("compare", "--controllers", "csc", "--ablation"), r"^companion compare: --ablation: .*adaptive/recommended"),
+        (("compare", "--controllers", "mine.yaml", "--presets", "foo"), r"--presets: expected a control law in --contr"),
+        (("compare", "--controllers", "mine.yaml", "--ablation"), r"--ablation: expected a control law in --controllers, "),
         (("compare", "--presets", "foo"), r"^companion compare: --presets foo: no such preset"),
         (("compare", "--payloads", "0.1,x"), r"^companion compare: .*--payloads: .*kg.*'0\.1,x'"),
         (("compare", "--seeds", "0"), r"^companion compare: .*--seeds: .*from 1"),

@@ -92,7 +92,7 @@ def test_campaigns_fly_a_file_of_gains(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.campaigns.robustness.plots.write_distribution", lambda *_: False)
     fly_made_up(monkeypatch, compare_row)
     words = ("--mission", str(CATCH), "--payloads", "0.2", "--seeds", "1", "--presets", "tuned")
-    ended = run_here("compare", *words, "--controllers", f"{file},psc", "--out", "out", "--json")
+    ended = run_here("compare", *words, "--controllers", f"{file},psc,{file}", "--out", "out", "--json")
     assert ended.code == EXIT_OK, ended.err
     rows = json.loads(ended.out)["rows"]
     assert [(row["controller"], row["preset"]) for row in rows] == [(file, "tuned"), ("psc", "tuned")]

@@ -9,9 +9,10 @@ of the flight was not completed: errors before a crash do not characterise the c
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -166,7 +167,7 @@ class Pairs:
         to be better.
         """
         n = sum(this != base for base, this in self.base_m_this_m)
-        return min(1.0, 2.0 * _at_most(min(self.better, n - self.better), n))
+        return min(1.0, 2 * next(itertools.islice(_tosses(n), min(self.better, n - self.better), None)) / (1 << n))
 
     @property
     def difference_95(self) -> tuple[float, float, float] | None:
@@ -175,7 +176,7 @@ class Pairs:
         """
         differences = sorted(this - base for base, this in self.base_m_this_m)
         n = len(differences)
-        outside = next(k for k in range(n + 1) if _at_most(k, n) > 0.025)
+        outside = next(k for k, count in enumerate(_tosses(n)) if 40 * count > 1 << n)
         return (differences[(n - 1) // 2], differences[outside - 1], differences[n - outside]) if outside else None
 
     def p50(self, part: int) -> float | None:
@@ -211,9 +212,10 @@ def _pairs(base: Group, this: Group) -> Pairs:
     return Pairs(this, [pair for pair in pairs if any(map(math.isfinite, pair))])
 
 
-def _at_most(k: int, n: int) -> float:
-    """Return the probability of at most k heads in n tosses of a fair coin."""
-    return sum(math.comb(n, j) for j in range(k + 1)) / math.exp2(n)
+def _tosses(n: int) -> Iterator[int]:
+    """Yield for k = 0, 1, ... how many of the 2^n series of n tosses of a coin have at most k heads."""
+    with_k = itertools.accumulate(range(n), lambda count, k: count * (n - k) // (k + 1), initial=1)
+    return itertools.accumulate(with_k)
 
 
 def _post_by_seed(group: Group) -> dict[int, float]:
