@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import json
 import math
 import os
 import socket
@@ -171,12 +172,11 @@ def _fly(arguments: argparse.Namespace) -> int:
         print_error("companion fly: --out: expected the name of a folder, got an empty one")
         return EXIT_BAD_INPUT
     if arguments.mqtt is not None:
-        off = arguments.mqtt == "off"
-        arguments.overrides += ["vehicle.ground.mqtt=null"] if off else [f"vehicle.ground.mqtt.url={arguments.mqtt}"]
-    if arguments.qgroundcontrol is not None:
-        arguments.overrides += [f"vehicle.ground.qgroundcontrol={arguments.qgroundcontrol}"]
-    if arguments.foxglove is not None:
-        arguments.overrides += [f"vehicle.ground.foxglove={arguments.foxglove}"]
+        off, url = arguments.mqtt == "off", json.dumps(arguments.mqtt)
+        arguments.overrides += ["vehicle.ground.mqtt=null" if off else f"vehicle.ground.mqtt.url={url}"]
+    for key in ("qgroundcontrol", "foxglove"):
+        if getattr(arguments, key) is not None:
+            arguments.overrides += [f"vehicle.ground.{key}={json.dumps(getattr(arguments, key))}"]
     if arguments.wait_for_start:
         arguments.overrides += ["mission.start.takeoff=by_operator"]
     config = _load(arguments, hardware=arguments.sitl is None, real_px4=arguments.sitl == "px4")

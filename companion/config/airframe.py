@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from companion.config.base import Fraction, Location, Model, NonNegative, Positive, Positive3, Vector3, refuse
+from companion.config.base import Location, Model, NonNegative, Positive, Positive3, Vector3, refuse
 from companion.model.rotors import (
     CCW,
     CW,
@@ -59,7 +59,7 @@ class Airframe(Model):
     """Thrust of all rotors at full command with a charged battery."""
     battery_cells: Annotated[int, Field(ge=1, le=10)] = 4
     """Number of lithium-polymer cells of the flight battery in series; used by the simulated battery and by its parameters in PX4."""
-    hover_thrust: Fraction | None = None
+    hover_thrust: Annotated[float, Field(gt=0, le=1)] | None = None
     """Normalised thrust that carries `mass_kg` in hover. If it is absent, PX4's MPC_THR_HOVER is used."""
     hover_thrust_adapt: bool = True
     """Whether the hover thrust is estimated in flight from the thrust sent, the IMU and the force sensor. If false, it stays

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import functools
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -65,7 +66,7 @@ def problems(group: str, name: str, options: Mapping[str, Any]) -> list[tuple[Lo
     if name == EXTERNAL and name in built_in:
         return [(("options",), "Extra inputs are not permitted")]
     try:
-        device_class(group, name).options.model_validate(dict(options))
+        device_class(group, name).options.model_validate_json(json.dumps(dict(options)), strict=True)
     except plugins.PluginError as error:
         return [(("type",), str(error))]
     except ValidationError as error:

@@ -109,10 +109,12 @@ def load_flight(
     controller: ControllerConfig | None = None
     controller_file: Document | None = None
     choice = mission.controller if mission is not None else _controller_choice(mission_file)
-    if controller_law is not None or preset is not None:
-        controller_file = _open_controller(controller_law or (choice.law if choice is not None else None), preset)
-    elif choice is not None and choice.file is not None:
+    if controller_law is None and choice is not None and choice.file is not None:
         controller_file = _open_named(mission_file, ("controller", "file"), None, lines, read_controller)
+        if controller_file is not None:
+            _suits(controller_file, mission_file, preset, lines)
+    elif controller_law is not None or preset is not None:
+        controller_file = _open_controller(controller_law or (choice.law if choice is not None else None), preset)
     elif choice is not None:
         controller_file = _open_controller(choice.law, choice.preset)
     if controller_file is not None:
@@ -333,14 +335,32 @@ def preset_of_file(path: str) -> str:
     return str(read_controller(path).data.get("preset"))
 
 
+def _suits(document: Document, mission_file: Document, preset: str | None, lines: list[str]) -> None:
+    """Add a line if the controller file of a mission is not that of the law or of the preset which is given as well."""
+    own, law = document.data.get("law"), mission_file.find(("controller", "law"))
+    if law not in (None, own):
+        text = f"expected {json.dumps(own)}, the law of controller.file, got {json.dumps(law)}; leave it out"
+        lines.append(f"{mission_file.origin(('controller', 'law'))}: controller.law: {text}")
+    try:
+        _has_preset(document, preset)
+    except ConfigError as error:
+        lines += error.lines
+
+
+def _has_preset(document: Document, preset: str | None) -> None:
+    own = document.data.get("preset")
+    if preset not in (None, own):
+        raise ConfigError(
+            f"--preset {preset}: the file {document.source} has the gains {json.dumps(own)}; leave --preset out"
+        )
+
+
 def _open_controller(law: str | None, preset: str | None) -> Document:
     """Read the file of a law's preset, or the file whose path is given in place of the law."""
     law = law or next(iter(PRESETS))
     if is_controller_file(law):
         document = read_controller(law)
-        own = document.data.get("preset")
-        if preset not in (None, own):
-            raise ConfigError(f"--preset {preset}: the file {law} has the gains {json.dumps(own)}; leave --preset out")
+        _has_preset(document, preset)
         return document
     if law not in PRESETS:
         raise ConfigError(

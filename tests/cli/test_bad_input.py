@@ -111,6 +111,12 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (*FLY, "--foxglove=localhost"),
         (r"^--set vehicle\.ground\.foxglove: expected HOST:PORT of this computer, such as .*got 'localhost'",),
     ),
+    "Foxglove at an address of IPv6 that nobody has": (
+        (*FLY, "--foxglove", "[2001:db8::1]:8765"),
+        (
+            r"^vehicle\.ground\.foxglove \(--foxglove\) is \[2001:db8::1\]:8765, but .*; give another: --foxglove HOST:PORT$",
+        ),
+    ),
     "Foxglove on another computer": (
         (*FLY, "--foxglove", "192.0.2.1:8765"),
         (

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from companion.config.controller import LAWS, PRESETS, AdaptiveConfig
+from companion.config.controller import LAWS, PRESETS, AdaptiveConfig, preset_file
 from companion.config.document import ConfigError
 from companion.config.loader import FlightConfig, load_flight, load_vehicle, logged_flight
 from companion.model.link_address import parse_address
@@ -119,6 +119,11 @@ BAD_MISSION = [
         "{file: ../controllers/none.yaml}",
         [f"{CATCH}:9:20: controller.file: configs/controllers/none.yaml: no such file"],
     ),
+    (
+        "{law: adaptive, preset: recommended}",
+        f"{{law: csc, file: {preset_file('psc', 'tuned').absolute()}}}",
+        [f'{CATCH}:9:19: controller.law: expected "psc", the law of controller.file, got "csc"; leave it out'],
+    ),
 ]  # fmt: skip
 
 
@@ -162,6 +167,7 @@ BAD_VEHICLE = [
     ("mass_kg: 3.0 ", "mass_kg: 0.4 ", ["mass_kg: 0.4 kg is the mass of the whole vehicle, but arm and tool alone have 0.45 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 20.0", ["thrust_max_n: 20 N do not lift 3 kg"]),
     ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  inertia_kg_m2: [0.02, 0.02, 0.05]", ["inertia_kg_m2[2]: expected at most 0.04 kg m^2 (no moment of a rigid body exceeds the sum of the other two), got 0.05"]),
+    ("thrust_max_n: 60.0", "thrust_max_n: 60.0\n  hover_thrust: 0", ["airframe.hover_thrust: expected a number > 0 and <= 1, got 0"]),
     ("safety:", "computer:\n  cpus: [2, 3, 2]\nsafety:", ["computer.cpus: expected each core once, got 2 twice in [2, 3, 2]"]),
 ]  # fmt: skip
 
@@ -313,6 +319,15 @@ def test_overrides_reach_every_section(project: Path) -> None:
     assert config.mission.phases[2].model_dump()["duration_s"] == 5.0
     assert config.world.faults[0].t_s == 6.0
     assert config.mission.name == "a=b"
+
+
+def test_the_controller_file_of_a_mission_is_not_replaced_by_a_preset_of_another_law(project: Path) -> None:
+    file = preset_file("psc", "tuned").absolute()
+    choice = ["mission.controller=null", f"mission.controller.file={file}"]
+    assert load_sitl(CATCH, preset="tuned", overrides=choice).controller.law == "psc"
+    [line] = lines_of(lambda: load_sitl(CATCH, preset="recommended", overrides=choice))
+    assert line == f'--preset recommended: the file {file} has the gains "tuned"; leave --preset out'
+    assert load_sitl(CATCH, controller_law="csc", preset="tuned", overrides=choice).controller.law == "csc"
 
 
 def test_override_of_a_key_and_a_section_that_the_file_leaves_to_defaults(project: Path) -> None:

@@ -224,6 +224,7 @@ def vehicle_file(tmp_path: Path, device_lines: str, servo: str = "null", without
     [
         ("type: odrive\n    options: {}", "null", "devices.arm.options.watchdog_timeout_s: Field required"),
         ("type: moteus", "null", "devices.arm.type: arm 'moteus': is not installed; installed: dynamixel, absent,"),
+        ("type: steady\n    options: {after: true}", "null", "devices.arm.options.after: Input should be a valid integer"),
         ("type: nooptions", "null", "(lab-arm 1.0): its attribute 'options' is not a subclass"),
         ("type: steady", "XM430-W210", "arm.joints[0].servo: must be null, because devices.arm.type is steady"),
         ("type: dynamixel", "null", "arm.joints[1].servo: expected the model of the servo, because devices.arm.type is dynamixel"),
