@@ -65,6 +65,9 @@ def _tune(arguments: argparse.Namespace) -> Tune:
     )
     words = ["companion", "fly", arguments.mission, "--sitl", "--world", arguments.world]
     words += [] if arguments.vehicle is None else ["--vehicle", arguments.vehicle]
+    # The controller file has its own overrides already.
+    sets = [override for override in arguments.overrides if not override.strip().startswith("controller.")]
+    words += ["--set", *sets] if sets else []
     return Tune(
         config=config,
         budget=arguments.budget,

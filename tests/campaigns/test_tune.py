@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -21,7 +22,7 @@ from companion.campaigns.tune.space import Point, Space
 from companion.config.controller import PRESETS, AdaptiveConfig, LawConfig
 from companion.config.loader import load_flight
 from companion.control.scaled_gains import joint_inertia_kg_m2
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from tests.campaigns.made_up import compare_row, draw_row, fly_made_up
 from tests.support import CATCH, HOVER, ROOT, run_here, set_options
 
@@ -221,7 +222,8 @@ TUNE = ("tune", "--mission", str(CATCH), "--preset", "paper", "--laboratories", 
 @pytest.mark.usefixtures("made_up")
 def test_an_interrupted_search_goes_on_and_ends_with_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.campaigns.tune.plots.write_pictures", lambda result, out: [])
-    words = (*TUNE, "--budget", "12")
+    own = "vehicle.airframe.payload_max_kg=0.3"
+    words = (*TUNE, "--budget", "12", "--set", own, "controller.load_leakage=0.1")
     assert run_here(*words, "--out", "whole").code == EXIT_OK
     flights = MadeUp.flown
     monkeypatch.setattr(MadeUp, "flown", 0)
@@ -243,7 +245,7 @@ def test_an_interrupted_search_goes_on_and_ends_with_the_same_bits(monkeypatch: 
     assert printed["evaluations"] == 12 and printed["file"] == "parts/controller.yaml" and printed["better"]
     assert printed["held_out"]["cost_after"] < printed["held_out"]["cost_before"]
     assert printed["held_out"]["change_95"][1] < 0.0
-    assert printed["fly"] == f"companion fly {CATCH} --sitl --world lab --controller parts/controller.yaml"
+    assert printed["fly"] == f"companion fly {CATCH} --sitl --world lab --set {own} --controller parts/controller.yaml"
     text = Path("parts/controller.yaml").read_text()
     for wanted in (
         "seed 1",
@@ -260,6 +262,22 @@ def test_an_interrupted_search_goes_on_and_ends_with_the_same_bits(monkeypatch: 
     assert refused.err_lines == [
         "companion tune: --out parts: holds another search: seed was 1, is 2; choose another folder"
     ]
+
+
+@pytest.mark.usefixtures("made_up")
+def test_a_full_disk_costs_no_flight_of_a_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MadeUp, "last", 3)
+    assert run_here(*TUNE, "--out", "out").code == EXIT_ABORTED
+    before = Path("out/flights.jsonl").read_bytes()
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out/flights.jsonl")
+
+    monkeypatch.setattr(Path, "replace", full)
+    ended = run_here(*TUNE, "--out", "out")
+    assert ended.code == EXIT_LOST
+    assert ended.err_lines == ["companion tune: out/flights.jsonl: cannot be written: No space left on device"]
+    assert Path("out/flights.jsonl").read_bytes() == before
 
 
 @pytest.mark.usefixtures("made_up")

@@ -13,6 +13,7 @@ from typing import Any, Self
 from companion.campaigns.process import CampaignProcess, Message
 from companion.campaigns.runner import INTERRUPTS, Row, progress_bar
 from companion.config.document import ConfigError
+from companion.runtime.files import write_whole
 from companion.runtime.subprocesses import signals_call
 
 FILE = "flights.jsonl"
@@ -98,11 +99,7 @@ class Flights(AbstractContextManager["Flights"]):
         """Read what was flown before, or begin a new file. A line that was cut short by the end of the program is dropped."""
         wanted = json.loads(json.dumps(settings))
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
-        read = [data for line in lines if (data := _parsed(line)) is not None]
-        if not read:
-            path.write_text(json.dumps(wanted) + "\n", encoding="utf-8")
-            return
-        begun, *known = read
+        begun, *known = [data for line in lines if (data := _parsed(line)) is not None] or [wanted]
         for key in sorted(begun.keys() | wanted.keys()):
             if begun.get(key) != wanted.get(key):
                 raise ConfigError(
@@ -110,7 +107,7 @@ class Flights(AbstractContextManager["Flights"]):
                     f"is {_short(wanted.get(key))}; choose another folder"
                 )
         self._known = {line["flight"]: line["row"] for line in known if "row" in line}
-        path.write_text("".join(json.dumps(line) + "\n" for line in read), encoding="utf-8")
+        write_whole(path, "".join(json.dumps(line) + "\n" for line in (begun, *known)).encode())
 
 
 def _key(flight: Message) -> str:

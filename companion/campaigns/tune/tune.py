@@ -119,7 +119,6 @@ def run(tune: Tune, out: Path, console: Console | None) -> int:
     """
     space, (training, held_out) = tune.space, tune.draws
     total = sum(batches_of(tune.budget, len(space.axes), training.count)) + 2 * held_out.count
-    flights = Flights(tune.job, out, tune.settings(), total, out / "campaign.log")
 
     def evaluate(points: Sequence[Point], numbers: Sequence[int]) -> list[list[float]]:
         settings = [space.settings(point) for point in points]
@@ -130,7 +129,7 @@ def run(tune: Tune, out: Path, console: Console | None) -> int:
 
     search = Search(space.start_point, training.count, tune.budget, tune.seed, evaluate)
     try:
-        with flights:
+        with Flights(tune.job, out, tune.settings(), total, out / "campaign.log") as flights:
             search.run(space.start_point)
             judged = _judge(search, space, held_out, flights)
         result = Result(tune.settings(), tune.command, tune.fly, space, search, training, held_out, judged)
