@@ -92,7 +92,10 @@ def plan_arm(delta_rad: Joints, limits: ArmLimits, duration_s: float = 0.0) -> A
         limit / abs(delta) for limit, delta in zip(limits.speed_max_rad_s, delta_rad, strict=True) if delta
     )
     # Ruckig plans in units of about the whole duration, where its numbers are neither large nor small.
-    unit_s = duration_s or (JERK_BOUND / jerk_per_s3) ** (1.0 / 3.0)
+    jerk_s = (JERK_BOUND / jerk_per_s3) ** (1.0 / 3.0)
+    least_s = max(jerk_s, 2.0 / math.sqrt(acceleration_per_s2), 1.0 / speed_per_s)
+    # The requested duration is far too short if a limit is absurdly low; `check_mission` reports that.
+    unit_s = least_s if 0.0 < 2.0 * duration_s < least_s else duration_s or jerk_s
     wanted = ruckig.InputParameter(1)
     wanted.current_position = [0.0]
     wanted.target_position = [1.0]
@@ -101,7 +104,7 @@ def plan_arm(delta_rad: Joints, limits: ArmLimits, duration_s: float = 0.0) -> A
     wanted.max_velocity = [min(speed_per_s * unit_s, SPEED_ENOUGH)]
     wanted.max_acceleration = [min(acceleration_per_s2 * unit_s**2, ACCELERATION_ENOUGH)]
     wanted.max_jerk = [min(jerk_per_s3 * unit_s**3, JERK_ENOUGH)]
-    wanted.minimum_duration = 1.0 if duration_s else None
+    wanted.minimum_duration = duration_s / unit_s if duration_s else None
     trajectory = ruckig.Trajectory(1)
     try:
         result = ruckig.Ruckig(1).calculate(wanted, trajectory)

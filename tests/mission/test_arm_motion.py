@@ -49,6 +49,16 @@ def test_any_move_keeps_its_limits_and_ends_at_rest(delta_rad: Joints, limits: A
     assert acceleration == pytest.approx((0.0, 0.0), abs=1e-6 * limits.jerk_max_rad_s3 * motion.duration_s)
 
 
+low = st.floats(1e-7, 20.0)
+
+
+@given(st.tuples(delta, delta), st.builds(ArmLimits, st.tuples(low, low), low, low), st.floats(1e-3, 60.0))
+def test_limits_that_are_absurdly_low_make_a_move_slow(delta_rad: Joints, limits: ArmLimits, duration_s: float) -> None:
+    assume(max(map(abs, delta_rad)) > 1e-6)
+    slowest_s = max(abs(to) / most for to, most in zip(delta_rad, limits.speed_max_rad_s, strict=True))
+    assert plan_arm(delta_rad, limits, duration_s).duration_s >= max(duration_s, slowest_s * (1.0 - 1e-6))
+
+
 @given(st.tuples(delta, delta), limits_of_any_kind, st.floats(0.1, 60.0))
 def test_value_speed_and_acceleration_do_not_jump(delta_rad: Joints, limits: ArmLimits, duration_s: float) -> None:
     assume(max(map(abs, delta_rad)) > 1e-6)
