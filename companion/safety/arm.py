@@ -45,6 +45,10 @@ CHANGE_SHARE: Final = 0.6
 CHANGE_HOLD_S: Final = 0.3
 CHANGE_ABOVE_M: Final = 0.1
 """Height above standing height from which the floor does not carry the vehicle."""
+CHANGE_CHASED_S: Final = 1.0
+"""Time after the accelerations of a chase until which the changes are not compared: while the vehicle swings, rotors and attitude lag, and
+its motion shows forces of several newtons that are none.
+"""
 CHANGE_AGE_MAX_S: Final = 0.05
 """Age of a sample from which there is no measured force to compare."""
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)
@@ -264,6 +268,8 @@ class ForceTracker:
         self._low_m = clearance_m + CHANGE_ABOVE_M
         self._measured, self._felt = _Change(), _Change()
         self._off_s = 0.0
+        self._swings_s = 0.0
+        """Time until the changes are compared again, after a chase."""
         self.off_n: tuple[Vec3, Vec3] | None = None
         """Changes of the measured force and of the force that moves the vehicle, when they first disagreed in this flight; the samples
         are not passed on from then on."""
@@ -297,7 +303,8 @@ class ForceTracker:
             return
         measured_n = control.force_measured_world_n or control.force_ext_world_n
         low = i.vehicle is None or i.vehicle.position_world_m[2] < self._low_m
-        if low or felt_n is None or self.age_s > CHANGE_AGE_MAX_S:
+        self._swings_s = CHANGE_CHASED_S if context.chases else max(0.0, self._swings_s - dt_s)
+        if low or felt_n is None or self.age_s > CHANGE_AGE_MAX_S or self._swings_s > 0.0:
             self._measured, self._felt = _Change(), _Change()
         elif self.trusted:
             self._disagree(dt_s, self._measured.update(dt_s, measured_n), self._felt.update(dt_s, felt_n))

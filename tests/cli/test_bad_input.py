@@ -6,6 +6,7 @@ Through the command's entry point, in this process; a few of each sort as a user
 from __future__ import annotations
 
 import re
+import shlex
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -213,3 +214,11 @@ def test_a_delay_of_the_servo_bus_is_refused_in_simulated_time(companion: Comman
     ended = companion(*FLY, "--set", "world.faults=[{kind: bus_delay, t_s: 1.0}]")
     assert ended.code == EXIT_BAD_INPUT
     assert "bus_delay: the servo bus takes no time in simulated time; add --real-time" in ended.err
+
+
+def test_the_line_that_a_copy_of_the_files_suggests_flies_from_any_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["init", str(tmp_path / "my files")]) == EXIT_OK
+    line = capsys.readouterr().out.splitlines()[-1].removeprefix("try: ")
+    assert shlex.split(line) == ["companion", "fly", str(tmp_path / "my files/missions/catch.yaml"), "--sitl"]
