@@ -23,8 +23,9 @@ from companion.sitl_config.loader import COMMAND_LINE_WORLD, SitlConfig, load_si
 PIPED_WIDTH = 132
 """Width of a table in columns if standard output is not a terminal."""
 CAMPAIGN_WIDTH = 168
-MISSION_MAX_S = 600.0
-"""Longest mission of a campaign: the fast loop keeps a flight in memory, 1.7 MB for each second."""
+MISSION_MAX_S = 300.0
+"""Longest mission of a campaign: the fast loop keeps a flight in memory, 1.7 MB for each second, and a slow computer must
+fly it within `companion.campaigns.process.STALL_TIMEOUT_S`."""
 
 
 def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | None = COMMAND_LINE_WORLD) -> None:

@@ -109,7 +109,7 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
         }
         for option in (option for option, value in given.items() if value):
             raise ConfigError(f"companion compare: {option}: expected a control law in --controllers, got files only")
-    variants = [Variant(file, preset := preset_of_file(file), preset) for file in files]
+    variants = [Variant(file, preset_of_file(file), None) for file in files]
     try:
         if laws or not files:
             variants += variants_of(PRESETS, laws, arguments.presets, arguments.ablation, arguments.adaptation)

@@ -241,6 +241,7 @@ CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
         (("compare", "--controllers", "csc", "--ablation"), r"^companion compare: --ablation: .*adaptive/recommended"),
         (("compare", "--controllers", "mine.yaml", "--presets", "foo"), r"--presets: expected a control law in --contr"),
         (("compare", "--controllers", "mine.yaml", "--ablation"), r"--ablation: expected a control law in --controllers, "),
+        (("compare", "--controllers", "nameless.yaml"), r"^nameless\.yaml:\d+:\d+: preset: missing; expected text$"),
         (("compare", "--presets", "foo"), r"^companion compare: --presets foo: no such preset"),
         (("compare", "--payloads", "0.1,x"), r"^companion compare: .*--payloads: .*kg.*'0\.1,x'"),
         (("compare", "--seeds", "0"), r"^companion compare: .*--seeds: .*from 1"),
@@ -261,6 +262,8 @@ def test_bad_input_is_one_line_and_nothing_flies(tmp_path: Path, words: tuple[st
     Path("taken").mkdir()
     Path("taken/compare.json").write_text("{}", encoding="utf-8")
     Path("empty.yaml").write_text(CASES, encoding="utf-8")
+    gains = preset_file("psc", "tuned").read_text(encoding="utf-8")
+    Path("nameless.yaml").write_text(gains.replace("preset: tuned\n", ""), encoding="utf-8")
     before = sorted(tmp_path.rglob("*"))
     mission = ("--mission", str(CATCH)) if words[0] == "compare" else () if "--cases" in words else (str(CATCH),)
     ended = run_here(words[0], *mission, *words[1:])

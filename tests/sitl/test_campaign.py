@@ -94,11 +94,11 @@ def test_a_flight_has_time_to_end_however_long_its_mission_takes(monkeypatch: py
     assert given[0] - 60.0 > Plan.build(config.mission, config.vehicle).duration_s > 90.0
 
 
-def test_a_mission_that_no_computer_could_keep_in_memory_is_refused() -> None:
+def test_a_mission_that_takes_longer_than_a_campaign_waits_for_is_refused() -> None:
     ended = run_here("compare", "--mission", "soak", "--seeds", "1")
     assert ended.code == EXIT_BAD_INPUT
     assert ended.err_lines == [
-        "soak: expected a mission of at most 600 s, got 3607 s; lower repeat, or fly it with companion fly"
+        "soak: expected a mission of at most 300 s, got 3607 s; lower repeat, or fly it with companion fly"
     ]
 
 

@@ -54,7 +54,8 @@ class Variant:
     controller: str
     preset: str
     """Name in the table: a preset, or a preset and the part that is removed from it."""
-    base_preset: str
+    base_preset: str | None
+    """Preset of a law; None for a file."""
     overrides: tuple[str, ...] = ()
 
     @property
