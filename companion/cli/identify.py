@@ -10,6 +10,7 @@ from typing import Any
 from companion.analysis.log import FlightLog, LogError
 from companion.config.document import ConfigError
 from companion.config.shipped import FILES, named_file
+from companion.config.yaml_strict import read_document
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.runtime.console import print_error
 
@@ -45,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
         ConfigError: the vehicle file or the folder cannot be used.
     """
     from companion.commissioning.identify.identification import identify
-    from companion.commissioning.identify.proposal import remarks, vehicle_changes, world_text
+    from companion.commissioning.identify.proposal import HOVER_THRUST, vehicle_changes, world_text
     from companion.commissioning.patch import propose
 
     try:
@@ -55,6 +56,9 @@ def run(arguments: argparse.Namespace) -> int:
         return EXIT_BAD_INPUT
     vehicle_file = _vehicle_file(arguments, found.flight.vehicle_file)
     changes = vehicle_changes(found)
+    left_to_px4 = None
+    if vehicle_file is not None and read_document(vehicle_file).find(HOVER_THRUST) is None:
+        left_to_px4 = changes.pop(HOVER_THRUST, None)
     patch = propose(vehicle_file, changes) if vehicle_file is not None and changes else None
     folder = Path(arguments.out) if arguments.out is not None else None if arguments.json else arguments.log.parent
     world = world_text(found, str(arguments.log))
@@ -74,8 +78,8 @@ def run(arguments: argparse.Namespace) -> int:
     for one in found.quantities:
         print(one.line())
     print()
-    for line in remarks(found, found.flight.vehicle):
-        print(line)
+    if left_to_px4 is not None:
+        print(f"PX4: set MPC_THR_HOVER to {left_to_px4}; the vehicle file leaves the hover thrust to PX4")
     if patch:
         print(patch.text)
         kept = f"written; the old file is kept as {backup}" if backup else "not written; add --apply to write it"

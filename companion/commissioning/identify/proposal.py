@@ -9,11 +9,10 @@ from typing import Any
 
 from companion.commissioning.arm.friction import one_constant
 from companion.commissioning.identify.identification import Identification
-from companion.commissioning.identify.quantity import SIGMAS_95, Quantity
+from companion.commissioning.identify.quantity import Quantity
 from companion.config.base import Location
 from companion.config.document import Data
 from companion.config.shipped import shipped_file
-from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
 from companion.config.yaml_text import flow_text
 from companion.model.constants import GRAVITY_M_S2
@@ -29,15 +28,17 @@ _ERROR_MAX = 0.5
 """Largest relative error that a world accepts."""
 
 
+HOVER_THRUST = ("airframe", "hover_thrust")
+"""Key of a vehicle file; a file without it leaves the hover thrust to PX4's MPC_THR_HOVER, with whose value the log has the key."""
+
+
 def vehicle_changes(found: Identification) -> dict[Location, Data]:
-    """Return the values of the vehicle file that contradict the flight: those outside of the 95 % intervals."""
-    vehicle = found.flight.vehicle
+    """Return the values of the flight's vehicle that contradict the flight: those outside of the 95 % intervals."""
+    arm, hover = found.flight.vehicle.arm, found["hover_thrust"]
+    configured = found.flight.vehicle.airframe.hover_thrust
     changes: dict[Location, Data] = {}
-    hover = found["hover_thrust"]
-    configured = vehicle.airframe.hover_thrust
     if hover.value is not None and configured is not None and not hover.contains(configured):
-        changes["airframe", "hover_thrust"] = round(hover.value, 4)
-    arm = vehicle.arm
+        changes[HOVER_THRUST] = round(hover.value, 4)
     together = one_constant(arm)
     constants = [found[f"joint{number + 1}_torque_per_amp_nm_a"] for number in range(len(arm.joints))]
     wrong = [one.known and not one.contains(has) for one, has in zip(constants, arm.torque_constants_nm_a, strict=True)]
@@ -178,14 +179,3 @@ def _uniform(low: float, high: float) -> dict[str, list[float]]:
 
 def _normal(mean: float, sigma: float) -> dict[str, list[float]]:
     return {"normal": [mean, max(1e-4, sigma)]}
-
-
-def remarks(found: Identification, vehicle: Vehicle) -> list[str]:
-    """Return the lines about what no file of ours holds."""
-    hover = found["hover_thrust"]
-    lines = []
-    if hover.value is not None and vehicle.airframe.hover_thrust is None:
-        lines.append(
-            f"PX4: MPC_THR_HOVER = {hover.value:.3f} (± {SIGMAS_95 * hover.sigma:.3f}; this vehicle file leaves it to PX4)"
-        )
-    return lines
