@@ -25,6 +25,7 @@ from companion.runtime.console import print_error
 
 PAGE = "side_by_side.html"
 RESULT = "side_by_side.json"
+_ANOTHER = "is the summary of another flight; outcome and payload are unknown"
 _NAME_BYTES_MAX = 200
 """Longest name of a folder that is named after flights, in bytes; file systems allow 255."""
 
@@ -139,7 +140,7 @@ def _known(path: Path, own: dict[str, Any]) -> tuple[dict[str, Any], str | None]
         same = known["loop"]["ticks"] == own["loop"]["ticks"] and times >= {event["t_s"] for event in own["events"]}
     except (KeyError, TypeError):
         return {}, f"{path}: is not the summary of a flight; outcome and payload are unknown"
-    return (known, None) if same else ({}, f"{path}: is the summary of another flight; outcome and payload are unknown")
+    return (known, None) if same else ({}, f"{path}: {_ANOTHER}")
 
 
 def _setting(log: FlightLog, name: str) -> str:
@@ -152,15 +153,18 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
     from companion.launcher.run import report_of
 
     flight = graded(path)
+    out = path.parent if arguments.out is None else Path(arguments.out)
+    writes = arguments.out is not None or not arguments.json
+    if writes and (_known(out / "summary.json", flight.summary)[1] or "").endswith(_ANOTHER):
+        raise _refusal(f"{out}: its summary.json is of another flight; choose another folder with --out")
     if flight.note is not None:
         print_error(flight.note)
     if arguments.gif is not None:
         _write_gif(flight, arguments.gif)
     if arguments.json:
         sys.stdout.write(to_json(flight.summary))
-        if arguments.out is None:
+        if not writes:
             return EXIT_OK
-    out = path.parent if arguments.out is None else Path(arguments.out)
     try:
         out.mkdir(parents=True, exist_ok=True)
         write_summary(flight.summary, out / "summary.json")

@@ -150,6 +150,12 @@ def test_a_summary_beside_the_log_that_is_of_another_flight_is_rejected(
     assert (one["outcome"], one["payload_kg"]) == ("crashed", 0.25)
     assert (other["outcome"], other["payload_kg"]) == ("lost", None)
     assert err == "summary.json: is the summary of another flight; outcome and payload are unknown\n"
+    before = contents(flights)
+    for words in (["short.mcap"], ["short.mcap", "--out", "."], ["short.mcap", "--out", ".", "--json"]):
+        assert main(["report", *words]) == EXIT_BAD_INPUT
+        line = "companion report: .: its summary.json is of another flight; choose another folder with --out\n"
+        assert capsys.readouterr() == ("", line)
+    assert contents(flights) == before
 
 
 def test_a_damaged_summary_beside_the_log_costs_one_line_and_no_more(
