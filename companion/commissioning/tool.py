@@ -144,6 +144,10 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
     """
     session = Session(arguments, tool.family)
     bus = session.vehicle.devices.arm
+    if tool.family is ARM and bus is None:
+        raise ConfigError(
+            f"companion {tool.name}: expected a vehicle with an arm, but arm is null in {arguments.vehicle}"
+        )
     if tool.servos_only and bus is not None and bus.type != DYNAMIXEL:
         raise ConfigError(f"companion {tool.name}: works with {DYNAMIXEL} servos only; devices.arm.type is {bus.type}")
     try:

@@ -73,6 +73,15 @@ def test_bad_input_opens_nothing(words: tuple[str, ...]) -> None:
     assert len(ended.err_lines) == 1
 
 
+@pytest.mark.parametrize("part", ["scan", "setup", "zero", "jog", "friction", "reboot"])
+def test_a_tool_of_the_arm_refuses_a_vehicle_without_one(part: str) -> None:
+    parts = ("vehicle.arm", "vehicle.tool", "vehicle.devices.arm", "vehicle.devices.force")
+    ended = run_here("arm", part, "--vehicle", VEHICLE, *set_options(**dict.fromkeys(parts)))
+    assert ended.code == EXIT_BAD_INPUT
+    [line] = ended.err_lines
+    assert line == f"companion arm {part}: expected a vehicle with an arm, but arm is null in {VEHICLE}"
+
+
 LOOPBACK = {"mocap.server": "127.0.0.1", "mocap.interface": "127.0.0.1"}
 POSE = ("--arm-pose", "90,0")
 
