@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import signal
 import socket
 from collections.abc import Callable, Coroutine, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
-from companion.model.commands import COMMANDS, SAFER_COMMANDS
+from companion.model.commands import COMMANDS, SAFER_COMMANDS, TABLE
 from companion.model.launcher_messages import Land
 from companion.model.outputs import Outputs
 from companion.model.types import GroundCommand, OperatorCommand, PhaseKind, SafetyAction
@@ -18,6 +19,8 @@ from companion.runtime import ipc
 WAITING_MAX = 32
 """Maximum number of queued commands. If there are more, the least severe are refused."""
 _GRAVEST_FIRST = {command: rank for rank, command in enumerate(COMMANDS.values())}
+_AGE_MAX_S = {row.command: row.age_max_s for row in TABLE if not row.safer}
+"""Age above which a RESUME or START is refused that has waited here or on its way from the recorder."""
 
 _T = TypeVar("_T")
 
@@ -75,12 +78,13 @@ class Operator:
         del self._waiting[WAITING_MAX:]
         return dropped
 
-    def next(self) -> TickCommand:
-        """Return the command of this tick.
+    def next(self, t_s: float) -> TickCommand:
+        """Return the command of the tick at `t_s` on the flight clock.
 
         A landing requested by the launcher or a signal stays requested, and every other command is refused. A command from the ground
         station lasts one tick. If it repeats the previous one, it is delayed by a tick, because the core counts rising edges. A RESUME
-        that names a hold other than the active one is refused. A START on the ground waits for the result of `recheck`.
+        that names a hold other than the active one is refused. A START on the ground waits for the result of `recheck`. A RESUME or
+        START that is too old by then is refused: its operator has been told that there was no answer.
         """
         waiting = self._waiting
         if self._land.is_set():
@@ -93,6 +97,11 @@ class Operator:
         if not waiting or waiting[0].command is self._given:
             self._given = OperatorCommand.NONE
             return TickCommand(OperatorCommand.NONE, None)
+        age_s, limit_s = t_s - waiting[0].t_s, _AGE_MAX_S.get(waiting[0].command, math.inf)
+        if age_s > limit_s:
+            asked, self._given, self._checking = waiting.pop(0), OperatorCommand.NONE, None
+            text = f"{asked.command.value} refused: it was given {age_s:.1f} s ago (limit {limit_s:.1f} s)"
+            return TickCommand(OperatorCommand.NONE, asked, f"{text}; check the situation, then command it again")
         if waiting[0].command is OperatorCommand.START and self.recheck is not None:
             checking = self._checking = self._checking or asyncio.ensure_future(self.recheck())
             self._given = OperatorCommand.NONE

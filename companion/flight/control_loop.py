@@ -101,7 +101,7 @@ class Flight:
             self._schedule_read(ticker.due_s)
         while True:
             now = await ticker.next()
-            turn = self._operator.next()
+            turn = self._operator.next(now.start_s)
             inputs, outputs, sent = await self._tick(tick, now.start_s, now.lateness_s, turn.command)
             if turn.asked is not None:
                 self._answer(turn.asked, turn.refused, outputs)

@@ -141,6 +141,8 @@ class GroundCommand(Record, frozen=True, kw_only=True):
     """Unique identifier of the command, which the answer repeats."""
     hold: int
     """Number of the hold that a RESUME ends, as in `Sent.hold`; 0 in all other commands."""
+    t_s: float
+    """Flight clock at which it was given, as its sender estimated."""
 
 
 class VehicleState(Record, frozen=True, kw_only=True):

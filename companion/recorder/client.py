@@ -177,10 +177,15 @@ class RecorderClient:
         match message:
             case {"error": str(error)}:
                 self.error = error
-            case {"command": str(name), "operator": str(operator), "nonce": str(nonce), "hold": int(hold)} if (
-                name in COMMANDS
-            ):
-                self._commands.append(GroundCommand(command=COMMANDS[name], operator=operator, nonce=nonce, hold=hold))
+            case {
+                "command": str(name),
+                "operator": str(who),
+                "nonce": str(nonce),
+                "hold": int(hold),
+                "t_s": float(t_s),
+            } if name in COMMANDS:
+                asked = GroundCommand(command=COMMANDS[name], operator=who, nonce=nonce, hold=hold, t_s=t_s)
+                self._commands.append(asked)
             case {"ground": str(text)}:
                 self.telemetry_status = text
 

@@ -285,6 +285,7 @@ class Uplink:
             "operator": command.operator,
             "nonce": command.nonce,
             "hold": command.hold,
+            "t_s": command.t_ms / 1000.0,
         }
         if self._recorder.flight.send(message):
             self._counts.commands += 1

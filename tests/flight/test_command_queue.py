@@ -36,13 +36,13 @@ def launcher_and_operator() -> Iterator[tuple[socket.socket, Operator]]:
 
 def asked(*commands: OperatorCommand) -> list[GroundCommand]:
     return [
-        GroundCommand(command=command, operator="anna", nonce=f"{number:032x}", hold=0)
+        GroundCommand(command=command, operator="anna", nonce=f"{number:032x}", hold=0, t_s=0.0)
         for number, command in enumerate(commands)
     ]
 
 
 def given(operator: Operator, ticks: int) -> list[OperatorCommand]:
-    return [operator.next().command for _ in range(ticks)]
+    return [operator.next(0.0).command for _ in range(ticks)]
 
 
 def test_each_command_has_one_tick_and_the_gravest_comes_first(
@@ -85,7 +85,7 @@ def in_tick(action: SafetyAction) -> Outputs:
 
 
 def resume(hold: int) -> GroundCommand:
-    return GroundCommand(command=RESUME, operator="anna", nonce="0" * 32, hold=hold)
+    return GroundCommand(command=RESUME, operator="anna", nonce="0" * 32, hold=hold, t_s=0.0)
 
 
 def test_a_resume_ends_the_hold_that_it_names_and_no_other(
@@ -97,18 +97,18 @@ def test_a_resume_ends_the_hold_that_it_names_and_no_other(
     assert operator.judged(HOLD, in_tick(SafetyAction.HOLD)) == 2, "held again: who saw the first has not seen this one"
     for named, meant in ((1, "hold 1"), (0, "no hold"), (3, "hold 3")):
         operator.ask([resume(named)])
-        turn = operator.next()
+        turn = operator.next(0.0)
         assert (turn.command, turn.asked) == (NONE, resume(named))
         assert (
             turn.refused
             == f"resume refused: it names {meant}, but hold 2 is active; check the situation, then command it again"
         )
     operator.ask([resume(2)])
-    assert operator.next() == TickCommand(RESUME, resume(2))
+    assert operator.next(0.0) == TickCommand(RESUME, resume(2))
     assert operator.judged(RESUME, in_tick(SafetyAction.NOMINAL)) is None
     operator.ask([resume(2)])
-    assert operator.next().command is NONE, "the same command again begins a tick later"
-    assert operator.next() == TickCommand(RESUME, resume(2)), "nothing stands: the core says so"
+    assert operator.next(0.0).command is NONE, "the same command again begins a tick later"
+    assert operator.next(0.0) == TickCommand(RESUME, resume(2)), "nothing stands: the core says so"
     assert operator.judged(RESUME, in_tick(SafetyAction.LAND)) is None
     assert operator.judged(NONE, in_tick(SafetyAction.HOLD)) == 3
 
@@ -116,7 +116,7 @@ def test_a_resume_ends_the_hold_that_it_names_and_no_other(
 async def _turns(operator: Operator, ticks: int = 6) -> list[TickCommand]:
     turns = []
     for _ in range(ticks):
-        turns.append(operator.next())
+        turns.append(operator.next(0.0))
         await asyncio.sleep(0)
     return turns
 
@@ -147,7 +147,34 @@ def test_a_start_waits_until_px4s_parameters_are_read_again(
     assert [turn.command for turn in asyncio.run(_turns(operator)) if turn.asked] == [HOLD], "no START after the HOLD"
     operator.judged(NONE, msgspec.structs.replace(in_tick(SafetyAction.NOMINAL), phase_kind=PhaseKind.FLIGHT))
     operator.ask([start])
-    assert operator.next() == TickCommand(START, start), "in the air nothing is read: the core refuses it"
+    assert operator.next(0.0) == TickCommand(START, start), "in the air nothing is read: the core refuses it"
+
+
+def test_a_start_or_resume_that_waited_too_long_is_refused_and_a_stop_is_not(
+    launcher_and_operator: tuple[socket.socket, Operator],
+) -> None:
+    """By then the ground station has reported that there was no answer: nobody expects the rotors to start."""
+    _, operator = launcher_and_operator
+
+    async def wait_for_parameters() -> list[TickCommand]:
+        async def recheck() -> str:
+            await asyncio.sleep(60.0)
+            return ""
+
+        operator.recheck = recheck
+        operator.ask(asked(START))
+        return [operator.next(t_s) for t_s in (0.0, 2.0, 2.1)]
+
+    *waits, late = asyncio.run(wait_for_parameters())
+    assert [turn.asked for turn in waits] == [None, None]
+    assert (late.command, late.asked) == (NONE, asked(START)[0])
+    advice = "check the situation, then command it again"
+    assert late.refused == f"start refused: it was given 2.1 s ago (limit 2.0 s); {advice}"
+    operator.ask(asked(RESUME))
+    assert operator.next(30.0).refused == f"resume refused: it was given 30.0 s ago (limit 2.0 s); {advice}"
+    for stop in (HOLD, LAND, ABORT):
+        operator.ask(asked(stop))
+        assert operator.next(30.0) == TickCommand(stop, asked(stop)[0])
 
 
 def test_a_resume_that_comes_right_behind_a_hold_does_not_undo_it(
@@ -159,7 +186,7 @@ def test_a_resume_that_comes_right_behind_a_hold_does_not_undo_it(
         operator.judged(HOLD, in_tick(SafetyAction.HOLD))
         operator.ask(commands)
         for _ in range(3):
-            command = operator.next().command
+            command = operator.next(0.0).command
             assert command in (HOLD, NONE)
             operator.judged(command, in_tick(SafetyAction.HOLD))
         assert operator.hold == 2
@@ -177,7 +204,7 @@ def test_each_is_answered_by_name(launcher_and_operator: tuple[socket.socket, Op
     _, operator = launcher_and_operator
     commands = asked(LAND, HOLD, START)
     operator.ask(commands)
-    assert [operator.next().asked for _ in range(4)] == [*commands, None]
+    assert [operator.next(0.0).asked for _ in range(4)] == [*commands, None]
 
 
 def test_of_too_many_the_mildest_are_dropped(launcher_and_operator: tuple[socket.socket, Operator]) -> None:
@@ -211,4 +238,4 @@ def test_the_launchers_landing_stays_and_commands_are_still_answered(
 
     assert asyncio.run(heard()) == [LAND] * 5
     operator.ask(asked(RESUME))
-    assert operator.next() == TickCommand(LAND, asked(RESUME)[0], "resume refused: a landing was commanded before")
+    assert operator.next(0.0) == TickCommand(LAND, asked(RESUME)[0], "resume refused: a landing was commanded before")

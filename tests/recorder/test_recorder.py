@@ -355,12 +355,12 @@ def say(recorder: socket.socket, **message: object) -> None:
 
 def test_commands_are_heard_in_the_tick_in_which_they_are_there(channel: tuple[RecorderClient, socket.socket]) -> None:
     client, recorder = channel
-    say(recorder, command="hold", operator="anna", nonce="a1", hold=0)
-    say(recorder, command="resume", operator="bob", nonce="b2", hold=3)
+    say(recorder, command="hold", operator="anna", nonce="a1", hold=0, t_s=1.0)
+    say(recorder, command="resume", operator="bob", nonce="b2", hold=3, t_s=2.0)
     client.record(*tick(0))
     assert client.take_commands() == [
-        GroundCommand(command=OperatorCommand.HOLD, operator="anna", nonce="a1", hold=0),
-        GroundCommand(command=OperatorCommand.RESUME, operator="bob", nonce="b2", hold=3),
+        GroundCommand(command=OperatorCommand.HOLD, operator="anna", nonce="a1", hold=0, t_s=1.0),
+        GroundCommand(command=OperatorCommand.RESUME, operator="bob", nonce="b2", hold=3, t_s=2.0),
     ]
     client.record(*tick(1))
     assert client.take_commands() == []
@@ -371,7 +371,7 @@ def test_more_than_fit_into_a_tick_wait_for_the_next_and_none_is_lost(
 ) -> None:
     client, recorder = channel
     for number in range(40):
-        say(recorder, command="hold", operator="anna", nonce=str(number), hold=0)
+        say(recorder, command="hold", operator="anna", nonce=str(number), hold=0, t_s=1.0)
     heard = []
     for k in range(3):
         client.record(*tick(k))
