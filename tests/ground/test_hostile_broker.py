@@ -113,6 +113,20 @@ def test_a_recording_of_an_earlier_flight_does_not_replace_the_current_one() -> 
     assert (known.session, known.proven.session) == ("now", "now")
 
 
+def test_of_two_flights_under_one_name_the_first_is_shown_and_commanded_while_it_lasts() -> None:
+    """As of two simulations on one computer: a command would go to the one that sent last."""
+    watch = VehicleTracker(signer=SIGNER)
+    for k in range(40):
+        for session, late_s in (("one", 0.0), ("two", 0.02)):
+            now_s = 50.0 + k / 20 + late_s
+            message = proven(stream_of(100.0 + k / 20, session, wall_s=2000.0 + now_s))
+            assert (watch.receive(STREAM, message, False, now_s) is not None) == (session == "one")
+            known = watch.vehicles["rig"].proven
+            assert known is not None and known.session == "one"
+    assert watch.rejected_text == f"{STREAM!r}: is of another flight under the name of the one that is shown"
+    assert watch.receive(STREAM, proven(stream_of(103.0, "two", wall_s=2053.0)), False, 53.0) is not None
+
+
 def test_the_next_flight_is_taken_though_the_clock_on_the_wall_was_set_back() -> None:
     watch = flying()
     later = proven(stream_of(1.0, "s2", wall_s=5.0))

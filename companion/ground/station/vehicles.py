@@ -148,8 +148,8 @@ class VehicleTracker:
                 raise MessageError(f"is from vehicle {record.vehicle!r:.60}")
             if isinstance(record, Ack) and not self._is_genuine(record, name):
                 raise MessageError("has no valid proof of the vehicle")
-            if isinstance(record, Stream) and not retained and not self._accept_stream(name, record, now_s):
-                raise MessageError("has no valid proof of the vehicle, unlike earlier ones")
+            if isinstance(record, Stream) and not retained:
+                self._check_stream(name, record, now_s)
         except MessageError as error:
             self.rejected += 1
             self.rejected_text = f"{topic!r:.80}: {error}"
@@ -181,19 +181,22 @@ class VehicleTracker:
         signer = self._signer
         return signer is None or ack.operator != signer.operator or ack_proven(ack, name, signer.key)
 
-    def _accept_stream(self, name: str, stream: Stream, now_s: float) -> bool:
-        """Store the state that a proven stream message carries; return False if the message must not be displayed.
+    def _check_stream(self, name: str, stream: Stream, now_s: float) -> None:
+        """Store the state that a proven stream message carries; raise MessageError if the message must not be displayed.
 
-        A message of a different flight is accepted if that flight is later on the vehicle's wall clock, or if the current flight no
-        longer sends messages. A recording of an earlier flight therefore cannot replace a running one.
+        A message of a different flight is accepted if that flight is later on the vehicle's wall clock by more than `LIVE_S`, or if
+        the current flight no longer sends messages. So neither a recording of an earlier flight nor a second flight under the same
+        name replaces a running one, to which the commands go.
         """
         known = self.vehicles.get(name)
         proven = known.proven if known is not None else None
         if self._signer is None or not stream_proven(stream, name, self._signer.key):
-            return proven is None or not proven.live(now_s)
+            if proven is not None and proven.live(now_s):
+                raise MessageError("has no valid proof of the vehicle, unlike earlier ones")
+            return
         if proven is not None and proven.session != stream.session:
-            if proven.live(now_s) and stream.wall_s <= proven.wall_s:
-                return False
+            if proven.live(now_s) and stream.wall_s <= proven.wall_s + LIVE_S:
+                raise MessageError("is of another flight under the name of the one that is shown")
             proven = None
         if proven is None:
             proven = ProvenState(
@@ -201,10 +204,9 @@ class VehicleTracker:
             )
             self._vehicle(name, now_s).proven = proven
         elif stream.t_s <= proven.t_s:
-            return False  # a replayed message: the vehicle sends only after a new tick
+            raise MessageError("was received before")  # the vehicle sends only after a new tick
         proven.wall_s, proven.t_s, proven.hold, proven.received_s = stream.wall_s, stream.t_s, stream.hold or 0, now_s
         proven.clock.add(stream.t_s, now_s)
-        return True
 
     def _vehicle(self, name: str, now_s: float) -> Vehicle:
         known = self.vehicles.get(name)
