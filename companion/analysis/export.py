@@ -54,10 +54,8 @@ def write_tables(log: FlightLog, out: Path, suffix: str) -> list[Path]:
     for topic, table in tables.items():
         path = out / f"{topic.removeprefix('/')}.{suffix}"
         table.to_csv(path) if suffix == "csv" else table.to_parquet(path)
-        periods_s = np.diff(table.index.to_numpy())
-        rate_hz = round(1.0 / float(np.median(periods_s)), 3) if len(periods_s) and topic != "/events" else None
         about["tables"][path.name] = {
-            "rate_hz": rate_hz,
+            "rate_hz": None if topic == "/events" else round(1.0 / TICK_PERIOD_S),
             "columns": {name: about_column(name) for name in table.columns},
         }
         written.append(path)

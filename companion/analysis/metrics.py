@@ -15,6 +15,7 @@ from companion.analysis.log import Array, FlightLog
 from companion.control.sensing import CatchDetector, ObservedCatchDetector
 from companion.model.arm_skeleton import logged_skeleton
 from companion.model.best_pose import best_pose
+from companion.model.constants import TICK_PERIOD_S
 from companion.model.frames import quat_rotate
 from companion.model.types import PhaseKind
 
@@ -163,29 +164,28 @@ def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
     t_s = log.columns.t_s[used]
     if not (used & post).any() or len(t_s) < 10 or not (np.diff(t_s) > 0).all():
         return None, None
-    period_s = float(np.median(np.diff(t_s)))
     rows = [0, 1, 2, *range(6, 6 + joints)]
     rate = log.column(lambda i, o, s: o.control.error_rate if o.control else None, 6 + joints)[used][:, rows]
     error = log.column(lambda i, o, s: o.control.error if o.control else None, 6 + joints)[used][:, rows]
-    e_tau = np.hstack([np.zeros((len(t_s), 3)), _joint_torque_error_nm(log, used, period_s)])
+    e_tau = np.hstack([np.zeros((len(t_s), 3)), _joint_torque_error_nm(log, used)])
     if not all(np.isfinite(values).all() for values in (error, rate, e_tau)):
         return None, None
     inertia, damping, stiffness = (np.array([base] * 3 + [joint] * joints) for base, joint in TARGET)
     spring = damping * rate + stiffness * error - e_tau
-    slow = lowpass_zero_phase(np.hstack([rate, spring]), period_s, SLIDING_LOWPASS_HZ)
+    slow = lowpass_zero_phase(np.hstack([rate, spring]), TICK_PERIOD_S, SLIDING_LOWPASS_HZ)
     d_i = inertia * np.gradient(slow[:, : len(rows)], t_s, axis=0) + slow[:, len(rows) :]
     after = d_i[post[used]]
     return rms_norm(after[:, 0:3]), rms_norm(after[:, 3:])
 
 
-def _joint_torque_error_nm(log: FlightLog, used: Mask, period_s: float) -> Array:
+def _joint_torque_error_nm(log: FlightLog, used: Mask) -> Array:
     """Return J'(F - F_d) for the ticks of the mask, N m, (ticks, joints); NaN if the logged configuration does not describe the arm."""
     joints = log.joint_count
     skeleton = logged_skeleton(log.config.get("vehicle"))
     if skeleton is None or len(skeleton.joint_axes) != joints:
         return np.full((int(used.sum()), joints), np.nan)
     force = log.column(lambda i, o, s: o.control.force_ext_world_n if o.control else None, 3)[used]
-    passing = np.stack([_passing(column, period_s / DESIRED_FORCE_TIME_S) for column in force.T.tolist()], axis=1)
+    passing = np.stack([_passing(column, TICK_PERIOD_S / DESIRED_FORCE_TIME_S) for column in force.T.tolist()], axis=1)
     quats = log.column(lambda i, o, s: i.vehicle.attitude_wxyz if i.vehicle else None, 4)[used]
     w, x, y, z = quats.T
     body_x = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)
@@ -241,7 +241,7 @@ def loop_rate_hz(log: FlightLog) -> float | None:
 
 def missed_deadlines(log: FlightLog) -> int:
     """Return the number of ticks that started more than one period late."""
-    return int((log.timing.lateness_s > log.timing.period_s).sum())
+    return int((log.timing.lateness_s > TICK_PERIOD_S).sum())
 
 
 def percentiles(durations_s: Array) -> dict[str, float | None]:

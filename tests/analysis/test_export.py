@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import json
 import shutil
@@ -10,7 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
+from companion.analysis.export import write_tables
 from companion.analysis.log import FlightLog
 from companion.cli.main import main
 from tests.analysis.synthetic_flight import record_flight
@@ -43,9 +46,20 @@ def test_a_table_holds_the_log_with_units_and_rate(pandas: Any, path: Path, tmp_
         pandas.testing.assert_frame_equal(table, wanted, check_dtype=False, check_exact=True)
         assert list(about[name]["columns"]) == list(wanted.columns)
     inputs = about[f"inputs.{suffix}"]
-    assert inputs["rate_hz"] == 200.0
+    assert (inputs["rate_hz"], about[f"events.{suffix}"]["rate_hz"]) == (200, None)
     assert inputs["columns"]["vehicle.velocity_world_m_s[2]"] == {"unit": "m/s", "frame": "world"}
     assert about[f"outputs.{suffix}"]["columns"]["arm_torque_nm[0]"] == {"unit": "N m", "frame": None}
+
+
+def test_the_rate_of_a_flight_in_simulated_time_is_that_of_the_loop(pandas: Any, path: Path, tmp_path: Path) -> None:
+    """Its ticks are 4 and 6 ms apart in turn."""
+    log = FlightLog.read(path)
+    inputs = tuple(replace(i, t_s=i.t_s + 0.001 * (i.tick % 2)) for i in log.inputs)
+    for first in (0, 1):
+        part = dataclasses.replace(log, inputs=inputs[first:], outputs=log.outputs[first:], sent=log.sent[first:])
+        write_tables(part, tmp_path, "csv")
+        about = json.loads((tmp_path / "columns.json").read_text(encoding="utf-8"))["tables"]
+        assert {about[f"{table}.csv"]["rate_hz"] for table in ("inputs", "outputs", "sent")} == {200}
 
 
 def test_a_dataset_has_the_layout_of_lerobot_and_the_values_of_the_logs(

@@ -166,15 +166,18 @@ def test_a_load_that_stays_is_no_impedance_error_and_an_impact_is() -> None:
             return i, o, s
         force = (0.0, 0.0, -2.0 if o.mission_t_s > since_s else 0.0)
         still = replace(o.control, force_ext_world_n=force, error=(0.0,) * 8, error_rate=(0.0,) * 8)
-        return i, replace(o, control=still), s
+        uneven_s = i.t_s + (0.0 if even else 0.001 * (i.tick % 2))  # as in simulated time: 4 and 6 ms in turn
+        return replace(i, t_s=uneven_s), replace(o, control=still), s
 
-    since_s = 0.0
+    since_s, even = 0.0, True
     _, always_nm = metrics.impedance_error(changed(loaded))
     since_s = 8.0
     _, impact_nm = metrics.impedance_error(changed(loaded))
     assert always_nm is not None
     assert impact_nm is not None
     assert always_nm < 0.01 < impact_nm
+    even = False
+    assert metrics.impedance_error(changed(loaded))[1] == pytest.approx(impact_nm, rel=1e-3)
 
 
 def test_the_zero_phase_lowpass_halves_a_sine_at_its_cutoff_and_leaves_slow_ones_in_place() -> None:
