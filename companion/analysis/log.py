@@ -201,7 +201,7 @@ class FlightLog:
         except ImportError:
             raise LogError(f"to_pandas: needs pandas: pip install '{DISTRIBUTION}[pandas]'") from None
         ticks_s = [inputs.t_s for inputs in self.inputs]
-        events = [(event, outputs.mission_t_s) for outputs in self.outputs for event in outputs.events]
+        events = [(event, outputs.mission_time_s(event)) for outputs in self.outputs for event in outputs.events]
         tables = {
             "/inputs": (ticks_s, map(_cells, self.inputs)),
             "/outputs": (ticks_s, map(_cells, self.outputs)),

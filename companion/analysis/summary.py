@@ -170,8 +170,7 @@ def _events(log: FlightLog) -> list[dict[str, Any]]:
     return [
         {
             "t_s": event.t_s,
-            # An event may be dated back to its cause.
-            "mission_t_s": max(0.0, outputs.mission_t_s + event.t_s - outputs.t_s) if outputs.mission_t_s else 0.0,
+            "mission_t_s": outputs.mission_time_s(event),
             "id": event.id,
             "severity": event.severity.value,
             "action": event.action.value,

@@ -268,7 +268,7 @@ class Flight:
         message = FlightEvent(
             tick=tick,
             t_s=event.t_s,
-            mission_t_s=outputs.mission_t_s,
+            mission_t_s=outputs.mission_time_s(event),
             id=event.id,
             severity=event.severity,
             action=event.action,

@@ -158,6 +158,10 @@ class Outputs(Record, frozen=True, kw_only=True):
     carry: CarryState | None = None
     """How the bar is carried; None while it is not."""
 
+    def mission_time_s(self, event: Event) -> float:
+        """Return the mission time of an event of this tick, which may be dated back to its cause; 0 before the take-off."""
+        return max(0.0, self.mission_t_s + event.t_s - self.t_s) if self.mission_t_s else 0.0
+
 
 class Sent(Record, frozen=True, kw_only=True):
     """What the drivers sent in one tick, and when."""

@@ -81,7 +81,7 @@ class LogWriter:
         # The tick is recorded: an error in its viewer messages must not count as a lost tick.
         try:
             for event in outputs.events:
-                self._event(stamp_ns, outputs.mission_t_s, event)
+                self._event(stamp_ns, outputs.mission_time_s(event), event)
             self._viewers.tick(stamp_ns, inputs, outputs)
             if self._live is not None:
                 self._live.tick(inputs.t_s, stamp_ns, texts)

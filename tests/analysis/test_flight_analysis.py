@@ -89,6 +89,9 @@ def test_a_catch_that_was_noticed_late_counts_from_the_time_it_is_dated() -> Non
     event = next(event for event in summary["events"] if event["id"] == "catch")
     assert summary["catch_t_s"] == pytest.approx(CATCH_S - 0.25, abs=0.005)
     assert event["mission_t_s"] == pytest.approx(summary["catch_t_s"])
+    pytest.importorskip("pandas")
+    events = log.to_pandas()["/events"]
+    assert events["mission_t_s"].tolist() == [event["mission_t_s"] for event in summary["events"]]
 
 
 def test_attitude_and_arm_rms_are_in_degrees_and_wrapped() -> None:

@@ -96,7 +96,9 @@ class StreamBuilder:
             self._frames_s.append(mocap.stamp_s)
         self._worst.add_tick(inputs, sent)
         for event in outputs.events:
-            self._append(EventLine.of(msgspec.structs.replace(event, text=truncated(event.text)), outputs.mission_t_s))
+            self._append(
+                EventLine.of(msgspec.structs.replace(event, text=truncated(event.text)), outputs.mission_time_s(event))
+            )
 
     def add_line(self, t_s: float, severity: str, source: str, text: str, *, replace_last: bool = False) -> None:
         """Add a line from a source other than the core: PX4, the guardian or the telemetry.
