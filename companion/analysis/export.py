@@ -13,6 +13,7 @@ import numpy as np
 from companion.analysis.log import FlightLog, LogError
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.units import unit_of
+from companion.runtime.files import write_whole
 
 ABOUT = "columns.json"
 """File beside the tables: for each table its rate, and for each column its unit and frame."""
@@ -53,13 +54,13 @@ def write_tables(log: FlightLog, out: Path, suffix: str) -> list[Path]:
     written = []
     for topic, table in tables.items():
         path = out / f"{topic.removeprefix('/')}.{suffix}"
-        table.to_csv(path) if suffix == "csv" else table.to_parquet(path)
+        write_whole(path, table.to_csv().encode() if suffix == "csv" else table.to_parquet())
         about["tables"][path.name] = {
             "rate_hz": None if topic == "/events" else round(1.0 / TICK_PERIOD_S),
             "columns": {name: about_column(name) for name in table.columns},
         }
         written.append(path)
-    (out / ABOUT).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    _write_json(out / ABOUT, about)
     return [*written, out / ABOUT]
 
 
@@ -167,15 +168,19 @@ def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
     units = {key: {column: about_column(column) for column in columns} for key, columns in names.items()}
     about = {"rate_hz": info["fps"], "columns": units}
     for path, content in (("meta/info.json", info), ("meta/stats.json", statistics), (ABOUT, about)):
-        (out / path).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        _write_json(out / path, content)
     return begun
+
+
+def _write_json(path: Path, content: Any) -> None:
+    write_whole(path, f"{json.dumps(content, indent=1)}\n".encode())
 
 
 def _write_parquet(path: Path, columns: dict[str, Any], index: Sequence[str] | None = None) -> None:
     import pandas
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    pandas.DataFrame(columns, index=index).to_parquet(path, index=index is not None)
+    write_whole(path, pandas.DataFrame(columns, index=index).to_parquet(index=index is not None))
 
 
 def _episode(log: FlightLog) -> dict[str, Any]:

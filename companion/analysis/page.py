@@ -70,7 +70,8 @@ def write_page(page: Page, path: Path) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    path.write_text(_environment().get_template("page.html").render(page=page), encoding="utf-8")
+    text = _environment().get_template("page.html").render(page=page)
+    path.write_bytes(text.encode(errors="replace"))  # the name of a file may be no text
 
 
 def _environment() -> Environment:

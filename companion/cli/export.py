@@ -20,7 +20,7 @@ def add_parser(commands: Any) -> None:
         "export",
         help="write logs as CSV or Parquet tables, as a LeRobot dataset, or as one file for Foxglove",
         description="csv, parquet: one table for each of inputs, outputs, sent and events, and columns.json with units and rates. "
-        "lerobot: one dataset (v2.1) with an episode for each log. foxglove: one file in which Foxglove shows the flights of all logs "
+        "lerobot: one dataset (v3.0) with an episode for each log. foxglove: one file in which Foxglove shows the flights of all logs "
         "in one scene, such as those of a team.",
     )
     export.add_argument("log", type=Path, nargs="+", help="flight.mcap")

@@ -249,6 +249,9 @@ def names_of(paths: Sequence[Path]) -> list[str]:
     if len(set(own)) < len(own) and len({path.resolve() for path in paths}) == len(paths):
         own = [f"{path.resolve().parent.parent.name}/{name}" if path.name == "flight.mcap" else
                f"{path.resolve().parent.name}/{name}" for path, name in zip(paths, own, strict=True)]  # fmt: skip
+    own = [
+        name.encode(errors="replace").decode() for name in own
+    ]  # a folder's name may be no text, which no page holds
     return [name if own.count(name) == 1 else f"{name} ({own[: n + 1].count(name)})" for n, name in enumerate(own)]
 
 

@@ -19,6 +19,7 @@ class LogFile:
         self._committed_bytes = 0
         self._position_bytes = 0
         self.error: str | None = None
+        self.failure: OSError | None = None
 
     def write(self, data: bytes | bytearray) -> int:
         """Append all data, or record the error; return the length in both cases."""
@@ -64,6 +65,8 @@ class LogFile:
         os.close(self._fd)
 
     def _fail(self, error: OSError) -> None:
+        error.filename = str(self._path)
+        self.failure = error
         self.error = f"recorder: {self._path}: {error.strerror}; the log ends here and the flight continues"
         with contextlib.suppress(OSError):
             os.ftruncate(self._fd, self._committed_bytes)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import heapq
 import json
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import foxglove
 from foxglove.channels import LogChannel
+from foxglove.mcap import MCAPWriteOptions
 from foxglove.messages import Log
 
 from companion.analysis.log import FlightLog
 from companion.model.outputs import Outputs
 from companion.model.types import Inputs
+from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LEVELS, clean
 from companion.recorder.viewer_channels import ViewerChannels, timestamp
 
@@ -34,21 +37,35 @@ def write_viewer_file(logs: Mapping[str, FlightLog], path: Path) -> None:
     epochs_ns = {name: int(log.metadata["companion"].get("epoch_offset_ns", "0")) for name, log in logs.items()}
     if all(log.clock == "simulated" for log in logs.values()):
         epochs_ns = dict.fromkeys(logs, max(epochs_ns.values()))
-    with path.open("xb") as file, foxglove.open_mcap(file, context=context):
-        lines = LogChannel("/log", context=context)
-        viewers = {name: ViewerChannels(context, f"{name}/") for name in logs}
-        for name, log in logs.items():
-            viewers[name].configure(log.config)
-            viewers[name].plan(json.loads(log.metadata.get("plan", {}).get("json", "null")))
-        ticks = [_ticks(name, log, epochs_ns[name]) for name, log in logs.items()]
-        for stamp_ns, name, inputs, outputs in heapq.merge(*ticks, key=lambda tick: tick[0]):
-            viewers[name].tick(stamp_ns, inputs, outputs)
-            for event in outputs.events:
-                level, stamp = LEVELS[event.severity.value], timestamp(stamp_ns)
-                line = Log(timestamp=stamp, level=level, message=clean(event.text), name=f"{name} {event.id}")
-                lines.log(line, log_time=stamp_ns)
+    file = LogFile(path)  # of a full disk the writer says only that a write has failed
+    try:
+        with foxglove.open_mcap(file, context=context, writer_options=MCAPWriteOptions(disable_seeking=True)):
+            _write(context, logs, epochs_ns)
+        if file.failure is not None:
+            raise file.failure
+    except BaseException:
+        path.unlink()
+        raise
+    finally:
+        file.close()
+
+
+def _write(context: foxglove.Context, logs: Mapping[str, FlightLog], epochs_ns: Mapping[str, int]) -> None:
+    lines = LogChannel("/log", context=context)
+    viewers = {name: ViewerChannels(context, f"{name}/") for name in logs}
+    for name, log in logs.items():
+        viewers[name].configure(log.config)
+        viewers[name].plan(json.loads(log.metadata.get("plan", {}).get("json", "null")))
+    ticks = [_ticks(name, log, epochs_ns[name]) for name, log in logs.items()]
+    for stamp_ns, name, inputs, outputs in heapq.merge(*ticks, key=lambda tick: tick[0]):
+        viewers[name].tick(stamp_ns, inputs, outputs)
+        for event in outputs.events:
+            level, stamp = LEVELS[event.severity.value], timestamp(stamp_ns)
+            line = Log(timestamp=stamp, level=level, message=clean(event.text), name=f"{name} {event.id}")
+            lines.log(line, log_time=stamp_ns)
 
 
 def _ticks(name: str, log: FlightLog, epoch_ns: int) -> Iterator[tuple[int, str, Inputs, Outputs]]:
     for inputs, outputs, _ in log.rows():
-        yield epoch_ns + round(inputs.t_s * 1e9), name, inputs, outputs
+        if math.isfinite(inputs.t_s):
+            yield epoch_ns + round(inputs.t_s * 1e9), name, inputs, outputs

@@ -45,6 +45,9 @@ def write_whole(
             part.replace(path)
         else:
             os.link(part, path)
+    except OSError as error:
+        error.filename = str(path)  # a failed write has none, and a failed open that of the temporary file
+        raise
     finally:
         with contextlib.suppress(OSError):
             part.unlink()

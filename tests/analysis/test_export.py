@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
+import os
+import resource
 import shutil
 from pathlib import Path
 from typing import Any
@@ -125,6 +127,42 @@ def test_what_cannot_be_exported_is_refused_in_one_line(
         err = capsys.readouterr().err
         assert err.count("\n") == 1
         assert reason in err
+
+
+@pytest.mark.parametrize(
+    ("form", "out", "lost"),
+    [
+        ("csv", ".", "inputs.csv"),
+        ("parquet", ".", "inputs.parquet"),
+        ("lerobot", "set", "set/data/chunk-000/file-000.parquet"),
+        ("foxglove", "both.mcap", "both.mcap"),
+    ],
+)
+def test_a_full_disk_is_one_line_and_no_file_is_cut_short(
+    pandas: Any, path: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, out: str, lost: str
+) -> None:
+    """A file of the same name keeps what an earlier export wrote."""
+    earlier = tmp_path / "inputs.csv"
+    earlier.write_text("of an earlier export")
+    size, limit = resource.getrlimit(resource.RLIMIT_FSIZE), 10_000
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, size[1]))  # Python gets EFBIG: it ignores the signal
+    try:
+        assert main(["export", str(path), "--format", form, "--out", str(tmp_path / out)]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, size)
+    assert capsys.readouterr().err == f"companion export: {tmp_path / lost}: cannot be written: File too large\n"
+    assert [one for one in tmp_path.rglob("*") if one.is_file()] == [earlier]
+    assert earlier.read_text() == "of an earlier export"
+
+
+def test_a_folder_whose_name_is_no_text_is_shown_with_a_question_mark(path: Path, tmp_path: Path) -> None:
+    odd = tmp_path / os.fsdecode(b"odd\xff") / "flight.mcap"
+    odd.parent.mkdir()
+    shutil.copy(path, odd)
+    both = [str(odd), str(path)]
+    assert main(["export", *both, "--format", "foxglove", "--out", str(tmp_path / "both.mcap")]) == 0
+    assert main(["report", *both, "--out", str(tmp_path / "page")]) == 0
+    assert "odd?" in (tmp_path / "page" / "side_by_side.html").read_text(encoding="utf-8")
 
 
 def test_lerobot_reads_the_dataset(pandas: Any, path: Path, tmp_path: Path) -> None:
