@@ -223,7 +223,8 @@ class PolicyLaw(SteeredLaw):
         """Return the settings with the file's SHA-256, after checking before the flight that the policy fits the vehicle.
 
         Raises:
-            ConfigError: the file is not a policy, was trained for another vehicle, returns NaN or takes too long.
+            ConfigError: the file is not a policy, was trained for another vehicle, returns NaN, draws its
+                actions or takes too long.
         """
         try:
             network = Network(config.file)
@@ -248,7 +249,7 @@ def _problem_of(network: Network, vehicle: Vehicle) -> str | None:
         if found != wanted:
             differ = [name for name in (*found, *wanted) if (name in found) != (name in wanted)]
             return f"its {what} are not those of this companion and vehicle: {differ[0] if differ else 'another order'}"
-    fastest_s = math.inf
+    fastest_s, answers = math.inf, dict[int, list[float]]()
     for step in range(_TIMED):
         deviations = (step % 3 - 1.0) * np.array(card.observation_scale)  # -1, 0 and 1 after normalisation
         begin_s = time.perf_counter()
@@ -256,6 +257,8 @@ def _problem_of(network: Network, vehicle: Vehicle) -> str | None:
         fastest_s = min(fastest_s, time.perf_counter() - begin_s)
         if not all(map(math.isfinite, action)):
             return f"returns {action}, which is not finite"
+        if answers.setdefault(step % 3, action) != action:
+            return "returns different actions for the same observation; export its mean, without sampling or dropout"
     if fastest_s > TIME_MAX_S:
         return f"takes {fastest_s * 1e3:.1f} ms for an action (limit {TIME_MAX_S * 1e3:g} ms, half a tick)"
     return None

@@ -162,6 +162,16 @@ def slow(path: Path, card: PolicyCard) -> None:
     mark(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9), card, path)
 
 
+def stochastic(path: Path, card: PolicyCard) -> None:
+    """A policy that was exported with the sampling of its training."""
+    written(path, card)
+    model = onnx.load(path)
+    model.graph.node[-1].output[0] = "mean"
+    model.graph.node.append(helper.make_node("RandomNormalLike", ["mean"], ["noise"], scale=0.01))
+    model.graph.node.append(helper.make_node("Add", ["mean", "noise"], ["action"]))
+    onnx.save(model, path)
+
+
 def of_another_size(path: Path, card: PolicyCard) -> None:
     more = {
         "observations": (*card.observations, "wind"),
@@ -180,6 +190,7 @@ def without_a_card(path: Path, card: PolicyCard) -> None:
 
 REFUSED: dict[str, tuple[Callable[[Path, PolicyCard], object], str]] = {
     "not a number": (not_a_number, "returns [nan, nan, nan, nan, nan], which is not finite"),
+    "stochastic": (stochastic, "returns different actions for the same observation; export its mean"),
     "slow": (slow, " ms for an action (limit 2.5 ms, half a tick)"),
     "unknown observation": (of_another_size, "its observations are not those of this companion and vehicle: wind"),
     "text": (lambda path, card: path.write_text("hello"), "expected a policy in an ONNX file, found none: "),
