@@ -128,7 +128,9 @@ class _Commander:
                     return None
                 if names and names[0] in known:
                     vehicle = known[names[0]]
-                    if vehicle.proven is not None or (waited and (vehicle.stream is not None or vehicle.ended)):
+                    if vehicle.proven is not None or (
+                        waited and (vehicle.stream is not None or vehicle.ended(time.monotonic()))
+                    ):
                         return names[0]
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LIVE_S):

@@ -97,7 +97,7 @@ def test_a_new_flight_has_a_clock_of_its_own_and_an_old_retained_state_does_not_
     known = watch.vehicles["rig"]
     assert known.session == "s2"
     assert known.clock.now_ms(102.0) == pytest.approx(2000, abs=1)
-    assert not known.ended
+    assert not known.ended(200.0)
 
 
 @pytest.mark.parametrize("signer", [None, SIGNER])

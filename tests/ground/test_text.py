@@ -82,6 +82,7 @@ def plain(text: str) -> str:
         (known(Presence.SILENT), 0.0, "SILENT", True),
         (known(Presence.LOST), 0.0, "LOST", True),
         (known(Presence.ENDED), 100.0, "ENDED: completed", False),
+        (known(Presence.ENDED), 0.0, "FLYING", False),  # the stream arrives
     ],
 )
 def test_the_status_word(vehicle: Vehicle, now_s: float, expected: str, alarm: bool) -> None:

@@ -199,7 +199,7 @@ class CommandSender:
             return f"no vehicle {vehicle!r:.60} is known"
         if known.proven is not None and known.proven.live(time.monotonic()):
             return None
-        if known.ended:
+        if known.ended(time.monotonic()):
             return f"the flight of {vehicle} has ended"
         if known.state is not None and known.state.session == known.session and not known.state.commands:
             return f"{vehicle} accepts no commands: {known.state.text or 'disabled'}; {FALLBACK_ADVICE}"

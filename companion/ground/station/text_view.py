@@ -70,7 +70,7 @@ def status_word(vehicle: Vehicle, now_s: float) -> tuple[str, str]:
     state, stream, age_s = vehicle.state, vehicle.stream, vehicle.stream_age_s(now_s)
     if state is not None and state.session == vehicle.session:
         match state.presence:
-            case Presence.ENDED:
+            case Presence.ENDED if vehicle.ended(now_s):
                 return f"ENDED: {printable(state.outcome or 'unknown outcome')}", "bold"
             case Presence.LOST:
                 return "LOST", _ALARM
@@ -97,7 +97,7 @@ def status_line(vehicle: Vehicle, now_s: float) -> str:
     """Return the state of one vehicle as one line, for pipes and logs."""
     parts = [printable(vehicle.name), status_word(vehicle, now_s)[0]]
     stream = vehicle.stream
-    if stream is not None and not vehicle.ended:
+    if stream is not None and not vehicle.ended(now_s):
         parts += [f"{printable(stream.phase)} {100 * stream.progress:.0f} %", f"t {stream.mission_t_s:.1f} s"]
         parts += [printable(stream.action), *_figures(stream)]
     if vehicle.events is not None and vehicle.events.lines:
@@ -113,7 +113,7 @@ def render(vehicle: Vehicle | None, now_s: float, station: StationStatus) -> Ren
     if vehicle is None:
         parts.append(Text("no vehicle yet", style="dim"))
     else:
-        old = stale(vehicle, now_s) or vehicle.ended
+        old = stale(vehicle, now_s) or vehicle.ended(now_s)
         parts += [_head(vehicle, now_s), *_body(vehicle, old)]
         details = [Text(), *_lights(vehicle, old), *_events(vehicle)]
     parts += [Text(), _keys(station)]

@@ -105,10 +105,11 @@ class Vehicle:
         age_s = self.stream_age_s(now_s)
         return age_s is not None and age_s < LIVE_S
 
-    @property
-    def ended(self) -> bool:
-        """Whether the vehicle has reported the end of its flight."""
-        return self.state is not None and self.state.presence is Presence.ENDED and self.state.session == self.session
+    def ended(self, now_s: float) -> bool:
+        """Whether the vehicle has reported the end of its flight and sends no stream any more; a state message has no proof."""
+        state = self.state
+        reported = state is not None and state.presence is Presence.ENDED and state.session == self.session
+        return reported and not self.live(now_s)
 
 
 class VehicleTracker:

@@ -123,10 +123,10 @@ def test_stale_figures_are_greyed_out(page: Page, how: str) -> None:
 
     page.show(relayed(in_flight()))
     alive = look()
-    if how == "stale":
-        page.run(1.0)
-    else:
+    if how == "ended":
         page.show(relayed(state(Presence.ENDED, outcome="completed")))
+        assert look() == alive, "the stream arrives: the vehicle flies, whoever has sent that it has ended"
+    page.run(1.0)
     assert all(one != other for one, other in zip(alive, look(), strict=True))
 
 

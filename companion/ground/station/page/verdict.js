@@ -26,12 +26,12 @@ export function worse(a, b) {
   return RANK[b] > RANK[a] ? b : a;
 }
 
-/** Presence of a vehicle: a live stream outweighs the retained state of an older session. */
+/** Presence of a vehicle: a live stream outweighs the retained state of an older session, and "ended", which has no proof. */
 export function presenceOf(vehicle, ageS) {
   const { state, stream } = vehicle;
   if (state === null) return stream === null ? "unknown" : "flying";
   const fresh = stream !== null && ageS !== null && ageS <= STALE_AFTER_S;
-  return fresh && state.session !== stream.session ? "flying" : state.presence;
+  return fresh && (state.session !== stream.session || state.presence === "ended") ? "flying" : state.presence;
 }
 
 /**
