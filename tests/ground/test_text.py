@@ -28,7 +28,7 @@ from companion.ground.protocol.keys import operators_text, write_private
 from companion.ground.protocol.messages import Presence, TetherView
 from companion.ground.protocol.proof import with_proofs
 from companion.ground.station.station import Station
-from companion.ground.station.text_monitor import _Screen
+from companion.ground.station.text_monitor import APART_S, CONFIRM_S, _Screen
 from companion.ground.station.text_view import STALE_S, Notice, StationStatus, render, stale, status_line, status_word
 from companion.ground.station.vehicles import Vehicle, VehicleTracker
 from companion.model.codec import to_json
@@ -165,7 +165,9 @@ class Terminal:
         while text not in plain(self._screen):
             assert time.monotonic() < end_s, f"{text!r} is not drawn: {plain(self._screen)}"
             if on and time.monotonic() - pressed_s > AGAIN_S:
-                self.press(on)
+                for key in on:
+                    self.press(key)
+                    await asyncio.sleep(APART_S + 0.05)
                 pressed_s = time.monotonic()
             if (await asyncio.to_thread(select.select, [self.ours], [], [], 1.0))[0]:
                 drawn = os.read(self.ours, 65536).decode("utf-8", "replace")
@@ -204,8 +206,10 @@ async def terminal_at(broker: Broker, folder: Path) -> AsyncIterator[Terminal]:
 
 
 @pytest.mark.parametrize("after", [{"session": "s2"}, {"hold": 2}, {"vehicle": "second"}], ids=str)
-def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any]) -> None:
-    """If vehicle, flight or hold has changed at the second press, it asks again."""
+def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """If vehicle, flight or hold has changed at the second press, it asks again; so it does if the two keys were pasted."""
+    now_s = 50.0
+    monkeypatch.setattr("companion.ground.station.text_monitor.time.monotonic", lambda: now_s)
     access = broker_access("mqtt://127.0.0.1", None, None)
     station = Station(access, SIGNER, None, lambda heard: None, lambda connected, text: None)
     screen = _Screen(Console())
@@ -220,9 +224,12 @@ def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any]) -> None:
 
     shown()
     assert screen._command("r", station) is None
+    now_s += APART_S
     shown(**after)
-    assert screen._command("r", station) is None
-    assert screen._command("r", station) is OperatorCommand.RESUME
+    assert [screen._command(key, station) for key in "rrr"] == [None] * 3
+    for waited_s, expected in ((CONFIRM_S, None), (APART_S, OperatorCommand.RESUME)):
+        now_s += waited_s
+        assert screen._command("r", station) is expected
 
 
 async def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broker, tmp_path: Path) -> None:

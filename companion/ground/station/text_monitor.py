@@ -26,8 +26,10 @@ from companion.runtime.terminal import pressed, raw_keys
 
 PERIOD_S = 0.125
 LINE_PERIOD_S = 1.0
-CONFIRM_S = 3.0
-"""Time within which the key of a command that needs confirmation must be pressed again."""
+APART_S, CONFIRM_S = 0.25, 3.0
+"""Shortest and longest time after which the key of a command that needs confirmation must be pressed again. Keys that arrive faster
+are pasted: "pass" must not start a flight.
+"""
 KEYS_MAX = 100
 KEYS = {row.key: row.command for row in TABLE}
 
@@ -127,7 +129,7 @@ class _Screen:
         if (
             unconfirmed is not None
             and unconfirmed[0] is command
-            and now_s - unconfirmed[1] < CONFIRM_S
+            and APART_S <= now_s - unconfirmed[1] < CONFIRM_S
             and unconfirmed[2] == target
         ):
             return command
