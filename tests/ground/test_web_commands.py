@@ -13,15 +13,15 @@ import pytest
 from companion.config.document import ConfigError
 from companion.ground.protocol.access import broker_access
 from companion.ground.protocol.keys import Operator, operators_text, write_private
-from companion.ground.protocol.messages import Presence
-from companion.ground.protocol.proof import Signer
+from companion.ground.protocol.messages import Presence, Topic
+from companion.ground.protocol.proof import Signer, with_proof
 from companion.ground.station.command_sender import ATTEMPTS, NO_ANSWER, signer_of
 from companion.ground.station.vehicles import LIVE_S
 from companion.model.commands import COMMANDS
 from companion.model.types import OperatorCommand
 from tests.broker import Broker, loopback_broker
-from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, on_page, token_of, viewer_of
-from tests.ground.vehicle import PlayedVehicle, played_vehicle
+from tests.ground.monitor_rig import ANNA, OPERATORS, SIGNER, monitor_at, on_page, token_of, until, viewer_of
+from tests.ground.vehicle import PlayedVehicle, ack_of, played_vehicle
 
 
 def with_data(**values: Any) -> Callable[[dict[str, Any]], bool]:
@@ -101,6 +101,31 @@ async def test_a_newer_command_ends_the_tries_of_an_older_one(broker: Broker) ->
         held = [message for message in viewer.heard if message["kind"] == "refused" and message["command"] == "hold"]
         assert [message["text"] for message in held] == [NO_ANSWER]
         assert [heard.command.value for heard in vehicle.accepted] == ["hold", "resume"]
+
+
+@pytest.mark.parametrize("answered", [True, False])
+async def test_the_monitor_goes_on_when_a_newer_command_is_answered_first(
+    broker: Broker, answered: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As by a vehicle that hears HOLD and LAND in one tick: it answers the gravest first."""
+    monkeypatch.setattr("companion.ground.station.command_sender.ANSWER_S", 2.0)
+    async with on_page(broker) as (vehicle, _monitor, viewer):
+        vehicle.answers = False
+        await viewer.until("stream")
+        await viewer.order("hold")
+        held = await viewer.until("sent")
+        await until(lambda: bool(vehicle.accepted))
+        vehicle.answers = True
+        await viewer.order("land")
+        await viewer.until("ack", with_data(command="land"))
+        if answered:
+            values = {"operator": ANNA.name, "command": OperatorCommand.HOLD, "text": "holding"}
+            await vehicle.say(Topic.ACK, with_proof(ack_of(vehicle.session, held["nonce"], **values), "rig", ANNA.key))
+            await viewer.until("ack", with_data(command="hold"))
+        else:
+            await viewer.until("refused", lambda message: message["command"] == "hold")
+        await viewer.order("abort")
+        await viewer.until("ack", with_data(command="abort"))
 
 
 async def test_commands_that_cannot_be_given_are_refused_with_the_reason(broker: Broker) -> None:

@@ -98,6 +98,7 @@ class CommandSender:
         self._signer = signer
         self._waiting: dict[str, asyncio.Future[Ack]] = {}
         self._newest: dict[str, object] = {}
+        """The newest command for each vehicle, while it is under way."""
 
     @property
     def operator(self) -> str | None:
@@ -141,14 +142,14 @@ class CommandSender:
                 if problem is None:
                     return answer.result()
                 current = _session(self._tracker.vehicles.get(vehicle))
-                on = number < tries and self._newest[vehicle] is order and current == session
+                on = number < tries and self._newest.get(vehicle) is order and current == session
                 notify(Failed(vehicle, command, problem + (f" (sent again, {number + 1} of {tries})" if on else "")))
                 if not on:
                     return None
         finally:
             for nonce in nonces:
                 del self._waiting[nonce]
-            if self._newest[vehicle] is order:
+            if self._newest.get(vehicle) is order:
                 del self._newest[vehicle]
         return None
 
