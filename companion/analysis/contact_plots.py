@@ -156,12 +156,9 @@ def found_surface(log: FlightLog) -> Figure | None:
 
 def _smooth(values: Array, t_s: Array) -> Array:
     """Return the mean over `_MEAN_S` about each tick."""
-    step_s = float(np.median(np.diff(t_s))) if len(t_s) > 1 else _MEAN_S
-    half = max(0, round(0.5 * _MEAN_S / max(step_s, 1e-3)))
     known = np.concatenate([[0.0], np.cumsum(np.nan_to_num(values))])
     count = np.concatenate([[0], np.cumsum(np.isfinite(values))])
-    low = np.maximum(np.arange(len(values)) - half, 0)
-    high = np.minimum(np.arange(len(values)) + half + 1, len(values))
+    low, high = np.searchsorted(t_s, t_s - 0.5 * _MEAN_S), np.searchsorted(t_s, t_s + 0.5 * _MEAN_S, "right")
     out: Array = (known[high] - known[low]) / np.maximum(count[high] - count[low], 1)
     return np.where(np.isfinite(values), out, np.nan)
 

@@ -15,7 +15,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from msgspec.structs import replace
 
-from companion.analysis import metrics, plot_style, plots
+from companion.analysis import contact_plots, metrics, plot_style, plots
 from companion.analysis.log import FlightLog
 from companion.analysis.report import write_report
 from companion.analysis.summary import empty_summary, summarise, write_summary
@@ -190,6 +190,17 @@ def test_the_zero_phase_lowpass_halves_a_sine_at_its_cutoff_and_leaves_slow_ones
         out = metrics.lowpass_zero_phase(rows, 0.005, 10.0)
         inner = slice(200, -200)
         assert np.allclose(out[inner], gain * rows[inner], atol=4e-3)
+
+
+def test_what_the_plots_of_a_contact_smooth_is_the_mean_of_a_tenth_of_a_second() -> None:
+    """Also in simulated time, in which ticks are 4 and 6 ms apart in turn, and across a gap."""
+    t_s = np.delete(np.cumsum(np.tile([0.004, 0.006], 100)), slice(120, 150))
+    impulse = np.where(np.arange(len(t_s)) == 100, 1.0, 0.0)
+    reached_s = t_s[contact_plots._smooth(impulse, t_s) > 0.0] - t_s[100]
+    assert (reached_s[0], reached_s[-1]) == (pytest.approx(-0.05), pytest.approx(0.05))
+    impulse = np.where(np.arange(len(t_s)) == 119, 1.0, 0.0)
+    reached_s = t_s[contact_plots._smooth(impulse, t_s) > 0.0] - t_s[119]
+    assert reached_s[-1] == 0.0
 
 
 def test_loop_and_latency_count_what_they_should() -> None:
