@@ -10,7 +10,10 @@ from pydantic import AfterValidator, Field, model_validator
 from companion.config.base import Model, refuse
 
 VEHICLE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}")
-_URL = re.compile(r"(?P<scheme>mqtts?)://(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(?::(?P<port>\d{1,5}))?/?")
+_NAME = r"[A-Za-z0-9_-]{1,63}(?:\.[A-Za-z0-9_-]{1,63})*\.?"
+"""A host's name: the resolver raises UnicodeError for one with an empty or too long part, such as gcs..lab."""
+_HOST = rf"(?P<host>\[[0-9A-Fa-f:.]+\]|{_NAME})"
+_URL = re.compile(rf"(?P<scheme>mqtts?)://{_HOST}(?::(?P<port>\d{{1,5}}))?/?")
 FOXGLOVE_DEFAULT = "127.0.0.1:8765"
 """Address of the Foxglove server if `--foxglove` gives none: Foxglove's usual port, for this computer only."""
 _LOOPBACK = re.compile(r"localhost|127\.\d{1,3}\.\d{1,3}\.\d{1,3}|::1")
@@ -54,7 +57,7 @@ def _a_broker(url: str) -> str:
     return url
 
 
-_STATION = re.compile(r"udpout://[^:/?\s]+:(?P<port>\d{1,5})")
+_STATION = re.compile(rf"udpout://{_NAME}:(?P<port>\d{{1,5}})")
 
 
 def _a_station(address: str) -> str:
@@ -64,7 +67,7 @@ def _a_station(address: str) -> str:
     return address
 
 
-_LISTENER = re.compile(r"(?P<host>\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):(?P<port>\d{1,5})")
+_LISTENER = re.compile(rf"{_HOST}:(?P<port>\d{{1,5}})")
 
 
 def listen_address(text: str) -> tuple[str, int]:

@@ -111,6 +111,8 @@ def test_bad_input_is_one_line(tmp_path: Path, log: Path) -> None:
         (["--cert", str(cert), "--key", "nofile.pem"], "--key nofile.pem: cannot be read"),
         (["--cert", str(key), "--key", str(cert)], "expected a certificate and its private key"),
         (["--broker", "localhost"], "--broker: expected mqtt://"),
+        (["--broker", "mqtts://gcs..lab"], "--broker: expected mqtt://"),
+        (["--broker", f"mqtts://{'a' * 64}.lab"], "--broker: expected mqtt://"),
         (["--broker", "mqtt://127.0.0.1:99999"], "--broker: expected a port"),
         (["--broker", "mqtts://127.0.0.1", "--ca", "nofile.pem"], "--ca nofile.pem: no such file"),
         (["--broker", "mqtts://127.0.0.1", "--ca", "README.md"], "--ca README.md: not a certificate"),
