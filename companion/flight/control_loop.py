@@ -207,8 +207,7 @@ class Flight:
             self._tell_asker(asked, verdict.accepted, sentence_of(verdict, asked.command), outputs)
 
     def _tell_asker(self, asked: GroundCommand, accepted: bool, text: str, after: Outputs) -> None:
-        about = (asked.nonce, asked.operator, asked.command)
-        self._recorder.client.ack(*about, accepted, text, after.t_s, after.phase, after.action)
+        self._recorder.client.ack(asked, accepted, text, after)
         done = CommandDone(
             mission_t_s=after.mission_t_s, operator=asked.operator, command=asked.command, accepted=accepted, text=text
         )

@@ -27,7 +27,7 @@ from companion.model.codec import to_packet
 from companion.model.commands import COMMANDS
 from companion.model.outputs import Outputs, Sent
 from companion.model.packets import Close, CommandAnswer, LogLine, Metadata, Packet, Tick
-from companion.model.types import GroundCommand, Inputs, OperatorCommand, SafetyAction, Severity
+from companion.model.types import GroundCommand, Inputs, Severity
 from companion.runtime import simulated_time
 from companion.runtime.subprocesses import JsonLines
 
@@ -81,39 +81,19 @@ class RecorderClient:
             self._commands = []
         return commands
 
-    def ack(
-        self,
-        nonce: str,
-        operator: str,
-        command: OperatorCommand,
-        accepted: bool,
-        text: str,
-        t_s: float,
-        phase: str,
-        action: SafetyAction,
-    ) -> bool:
+    def ack(self, asked: GroundCommand, accepted: bool, text: str, after: Outputs) -> bool:
         """Send the result of a command.
 
         Args:
-            nonce, operator, command: fields of the command that `take_commands` returned.
             accepted: the command took effect, or the requested state was reached before.
             text: what was done, or why the command was refused.
-            t_s: flight clock of the tick that handled it.
-            phase, action: phase and action of that tick's `Outputs`.
+            after: outputs of the tick that handled it.
         """
-        return self._send(
-            CommandAnswer(
-                number=self._offered,
-                nonce=nonce,
-                operator=operator,
-                command=command,
-                accepted=accepted,
-                text=text,
-                t_s=t_s,
-                phase=phase,
-                action=action,
-            )
-        )
+        answer = CommandAnswer(
+            number=self._offered, nonce=asked.nonce, operator=asked.operator, command=asked.command, accepted=accepted, text=text,
+            t_s=after.t_s, phase=after.phase, action=after.action,
+        )  # fmt: skip
+        return self._send(answer)
 
     def text(self, t_s: float, severity: Severity, source: str, text: str) -> bool:
         """Write a line to the log's `/log` channel; `t_s` is the flight clock."""

@@ -39,6 +39,10 @@ from tests.support import DEADLINE_S
 EPOCH_NS = 1_700_000_000_000_000_000
 
 
+def asked(command: OperatorCommand) -> GroundCommand:
+    return GroundCommand(command=command, operator="anna", nonce="a1", hold=0, t_s=1.0)
+
+
 def tick(k: int, text: str = "") -> tuple[Inputs, Outputs, Sent]:
     t_s = k * 0.005
     pose = MocapPose(
@@ -157,7 +161,7 @@ def test_every_tick_is_in_the_log_with_its_stamp_schema_and_metadata(recorder: R
 def test_events_and_answers_reach_the_log_channel_for_people_and_count_as_packets(recorder: RecorderProcess) -> None:
     recorder.client.record(*tick(0, "something odd"))
     offer(recorder, range(1, 10))
-    recorder.client.ack("a1", "anna", OperatorCommand.LAND, True, "landing", 0.05, "hold", SafetyAction.LAND)
+    recorder.client.ack(asked(OperatorCommand.LAND), True, "landing", tick(9)[1])
     offer(recorder, range(10, 20))
     report = recorder.finish(DEADLINE_S)
     assert (report.samples, report.dropped, report.error) == (20, 0, None)
@@ -359,7 +363,7 @@ def test_commands_are_heard_in_the_tick_in_which_they_are_there(channel: tuple[R
     say(recorder, command="resume", operator="bob", nonce="b2", hold=3, t_s=2.0)
     client.record(*tick(0))
     assert client.take_commands() == [
-        GroundCommand(command=OperatorCommand.HOLD, operator="anna", nonce="a1", hold=0, t_s=1.0),
+        asked(OperatorCommand.HOLD),
         GroundCommand(command=OperatorCommand.RESUME, operator="bob", nonce="b2", hold=3, t_s=2.0),
     ]
     client.record(*tick(1))
@@ -419,7 +423,7 @@ def test_an_error_and_the_way_to_the_ground_are_known_the_newest_counts(
 def test_an_answer_is_a_packet_in_its_turn(channel: tuple[RecorderClient, socket.socket]) -> None:
     client, recorder = channel
     client.record(*tick(0))
-    client.ack("a1", "anna", OperatorCommand.HOLD, True, "holding", 1.25, "hold", SafetyAction.HOLD)
+    client.ack(asked(OperatorCommand.HOLD), True, "holding", tick(250)[1])
     recorder.recv(2**20)
     assert read_packet(recorder.recv(2**20)) == CommandAnswer(
         number=1,
@@ -429,6 +433,6 @@ def test_an_answer_is_a_packet_in_its_turn(channel: tuple[RecorderClient, socket
         accepted=True,
         text="holding",
         t_s=1.25,
-        phase="hold",
-        action=SafetyAction.HOLD,
+        phase="ground",
+        action=SafetyAction.NOMINAL,
     )

@@ -24,7 +24,7 @@ from companion.ground.protocol.messages import (
     Topic,
     decode,
 )
-from companion.model.types import OperatorCommand, SafetyAction, Severity
+from companion.model.types import GroundCommand, OperatorCommand, Severity
 from tests.broker import Broker, loopback_broker
 from tests.recorder.telemetry_rig import ROWS, VEHICLE, Listener, flight_with, log_lines
 from tests.support import DEADLINE_S, free_port, wait_until
@@ -46,9 +46,8 @@ def test_every_topic_follows_its_schema_and_is_there_for_those_who_come_late(tmp
         state = listener.wait(Topic.STATE, State, lambda state: state.presence is Presence.FLYING and state.commands)
         flight.fly(600)
         client.text(2.9, Severity.WARNING, "px4", "Preflight Fail: ears are cold")
-        client.ack(
-            "0" * 32, "anna", OperatorCommand.HOLD, True, "holding", t_s=3.0, phase="catch", action=SafetyAction.HOLD
-        )
+        asked = GroundCommand(command=OperatorCommand.HOLD, operator="anna", nonce="0" * 32, hold=0, t_s=3.0)
+        client.ack(asked, True, "holding", ROWS[600][1])
         flight.fly(2000)
         listener.wait(Topic.STREAM, Stream, lambda stream: stream.t_s > 5.0)
         flight.fly(len(ROWS))

@@ -27,7 +27,7 @@ from companion.ground.protocol.commands import make_command
 from companion.ground.protocol.keys import load_operators, new_key, write_private
 from companion.ground.protocol.messages import Ack, Events, Presence, State, Topic
 from companion.model.codec import to_json
-from companion.model.types import GroundCommand, OperatorCommand, SafetyAction
+from companion.model.types import GroundCommand, OperatorCommand
 from tests.broker import Broker, loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
 from tests.recorder.telemetry_rig import ROWS, VEHICLE, Listener, command, config_of, flight_with, log_lines
@@ -61,9 +61,7 @@ def test_a_signed_command_reaches_the_flight_and_its_answer_comes_back(tmp_path:
         assert (asked.command, asked.operator, asked.nonce) == (
             OperatorCommand.HOLD, "anna", json.loads(genuine)["nonce"],
         )  # fmt: skip
-        client.ack(
-            asked.nonce, asked.operator, asked.command, True, "holding", t_s=5.0, phase="x", action=SafetyAction.HOLD
-        )
+        client.ack(asked, True, "holding", ROWS[1000][1])
         flight.fly(2000)
         answer = listener.wait(Topic.ACK, Ack, lambda ack: ack.accepted)
         assert (answer.nonce, answer.text, answer.session) == (asked.nonce, "holding", state.session)
@@ -163,7 +161,7 @@ def test_a_full_disk_costs_the_log_and_neither_a_command_nor_its_answer(tmp_path
 
         flight.wait(came, "the command does not come")
         assert [asked.command for asked in heard] == [OperatorCommand.LAND]
-        client.ack(heard[0].nonce, "anna", OperatorCommand.LAND, True, "landing", 9.0, "land", SafetyAction.LAND)
+        client.ack(heard[0], True, "landing", ROWS[1000][1])
         assert listener.wait(Topic.ACK, Ack).text == "landing"
 
 
