@@ -17,9 +17,9 @@ from collections.abc import Callable, Sequence
 import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
+from companion.recorder.viewer_channels import due
+
 PERIOD_S = 0.05
-_EARLY_S = 0.0025
-"""Time by which a record may be sent before it is due: half a tick."""
 _BACKLOG_MESSAGES = 256
 """Messages that wait for one viewer: about a second of flight."""
 _LIVE = "live"
@@ -79,7 +79,7 @@ class LiveViewers:
             stamp_ns: wall clock of the tick.
             texts: the records as JSON, in the order of their channels.
         """
-        if 0.0 <= t_s - self._sent_s < PERIOD_S - _EARLY_S:
+        if not due(t_s, self._sent_s, PERIOD_S):
             return
         self._sent_s = t_s
         for channel, text in zip(self._channels, texts, strict=True):

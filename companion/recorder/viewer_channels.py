@@ -127,7 +127,7 @@ class ViewerChannels:
             inputs, outputs: the tick's records. After a step back of the flight clock everything is due.
         """
         t_s = inputs.t_s
-        frames_due, scene_due = _due(t_s, self._due_s, PERIOD_S), _due(t_s, self._scene_due_s, SCENE_PERIOD_S)
+        frames_due, scene_due = due(t_s, self._due_s, PERIOD_S), due(t_s, self._scene_due_s, SCENE_PERIOD_S)
         if not (frames_due or scene_due) or not math.isfinite(t_s):
             return
         stamp = timestamp(stamp_ns)
@@ -214,7 +214,7 @@ class ViewerChannels:
             self._flown_trail.add(t_s, pose[0])
         if reference is not None:
             self._reference_trail.add(t_s, reference.position_world_m)
-        if not _due(t_s, self._path_due_s, PATH_PERIOD_S):
+        if not due(t_s, self._path_due_s, PATH_PERIOD_S):
             return
         self._path_due_s = t_s
         entities = [
@@ -293,7 +293,7 @@ def _log_pose(
     channel.log(PoseInFrame(timestamp=stamp, frame_id="world", pose=pose), log_time=stamp_ns)
 
 
-def _due(t_s: float, last_s: float, period_s: float) -> bool:
+def due(t_s: float, last_s: float, period_s: float) -> bool:
     """Whether a period has passed; also true if the clock has gone back or is not finite."""
     return not 0.0 <= t_s - last_s < period_s - _EARLY_S
 
