@@ -21,15 +21,17 @@ from companion.flight.main import plugins_of_others
 from companion.mission.check import check_mission
 from companion.mission.plan import Plan
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from companion.model.types import OperatorCommand, Outcome, SafetyAction
+from companion.model.outputs import Outputs
+from companion.model.types import Inputs, OperatorCommand, Outcome, SafetyAction
 from companion.plugins import PHASES
 from companion.sitl_config.loader import load_sitl
 from companion.testing import check_phases
 from sitl.fast.loop import FastFlight
 from sitl.testing import check_flight
-from tests.flights.ends import after
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import ROOT
+
+pytestmark = pytest.mark.usefixtures("short_wait")
 
 EXAMPLE = ROOT / "examples/phase"
 MISSION = EXAMPLE / "weigh.yaml"
@@ -148,7 +150,7 @@ def test_the_pages_phase_that_moves_keeps_the_contract_and_flies(tmp_path: Path)
     write_distribution(tmp_path, "lab-square", "0.1.0", {"square": "lab_square:Square"}, PHASES)
     mission = tmp_path / "square.yaml"
     hover = (ROOT / "configs/missions/hover.yaml").read_text(encoding="utf-8")
-    moved = hover.replace("type: hold, duration_s: 5.0", "type: square, side_m: 0.8, speed_m_s: 0.4")
+    moved = hover.replace("type: hold, duration_s: 5.0", "type: square, side_m: 0.4, speed_m_s: 0.4")
     mission.write_text(moved.replace("../vehicles", str(ROOT / "configs/vehicles")), encoding="utf-8")
     with on_path(tmp_path):
         check_phases(mission)
@@ -194,24 +196,48 @@ SOON = [
 """The mission without its way: it weighs some seconds after the take-off, high enough to hold."""
 
 
-@pytest.mark.parametrize("method", list(RAISES))
-def test_a_phase_that_raises_in_the_air_is_named_and_the_vehicle_lands(site: Path, method: str) -> None:
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> list[Inputs]:
+    """The inputs of a flight, until it has weighed for a while."""
+    folder = tmp_path_factory.mktemp("flown")
+    shutil.copy(EXAMPLE / "lab_weigh.py", folder)
+    write_distribution(folder, "lab-weigh", "0.1.0", {"weigh": "lab_weigh:Weigh"}, PHASES)
+    ticks = itertools.count()
+    with on_path(folder):
+        flight = FastFlight(load_sitl(MISSION, overrides=SOON))
+        return flight.run(until=lambda o: o.phase == "weigh" and next(ticks) == 20).inputs
+
+
+def broken(site: Path, method: str) -> FastFlight:
     right, wrong = RAISES[method]
     assert right in CODE
     (site / "lab_weigh.py").write_text(CODE.replace(right, wrong))
-    flight = FastFlight(load_sitl(MISSION, overrides=SOON))
-    ticks = itertools.count()
-    ends = {"step": None, "leave": lambda o: o.phase == "weigh" and next(ticks) == 20}
-    result = flight.run(until=ends.get(method, after("phase_failed", 0.5)))
-    outputs = result.outputs
-    if method == "leave":  # a hold during the phase
-        core = FlightCore(flight.config.flight)
-        outputs = [core.step(inputs) for inputs in result.inputs]
-        outputs.append(core.step(replace(result.inputs[-1], command=OperatorCommand.HOLD)))
-    else:
-        assert not result.crashed and (method != "step" or outputs[-1].outcome is Outcome.ABORTED)
-        assert SafetyAction.AUTOPILOT_LAND not in {output.action for output in outputs}, "lands under its own control"
+    return FastFlight(load_sitl(MISSION, overrides=SOON))
+
+
+def failed(outputs: list[Outputs]) -> str:
     (event,) = [event for output in outputs for event in output.events if event.id == "phase_failed"]
     assert event.text.startswith("phase 'weigh' failed: ")
-    assert ("(lab_weigh.py:" in event.text) != method.startswith(("short", "not", "joints", "expects")), event.text
     assert SafetyAction.LAND in {output.action for output in outputs}
+    assert SafetyAction.AUTOPILOT_LAND not in {output.action for output in outputs}, "lands under its own control"
+    return event.text
+
+
+def test_a_phase_that_raises_in_the_air_is_named_and_the_vehicle_lands(site: Path) -> None:
+    flight = broken(site, "step")
+    result = flight.run()
+    assert "(lab_weigh.py:" in failed(result.outputs)
+    assert not result.crashed and result.outputs[-1].outcome is Outcome.ABORTED
+
+
+@pytest.mark.parametrize("method", [method for method in RAISES if method != "step"])
+def test_whatever_of_a_phase_raises_or_returns_what_cannot_be_flown_it_is_named(
+    site: Path, method: str, inputs: list[Inputs]
+) -> None:
+    """A hold, during the phase, leaves it."""
+    core = FlightCore(broken(site, method).config.flight)
+    outputs = [core.step(i) for i in inputs]
+    if method == "leave":
+        outputs.append(core.step(replace(inputs[-1], command=OperatorCommand.HOLD)))
+    text = failed(outputs)
+    assert ("(lab_weigh.py:" in text) is (method in ("reference", "leave")), text
