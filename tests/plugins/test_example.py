@@ -75,6 +75,9 @@ def test_laws_and_phases_of_others_need_nothing_but_the_public_api() -> None:
 def test_their_own_tests_pass(site: Path, tmp_path: Path) -> None:
     for test in (EXAMPLE / "test_lab_lqr.py", BASELINES / "test_baselines.py"):
         shutil.copy(test, tmp_path)
+    short = f"partial(sitl.testing.check_catch, mission={str(SHORT_CATCH)!r})"
+    text = f"from functools import partial\nimport sitl.testing\nsitl.testing.check_catch = {short}\n"
+    (tmp_path / "conftest.py").write_text(text)
     # PID and L1 differ from each other by their adaptation, and from the law of the companion by less: the other two fly a catch here.
     command = [
         sys.executable,
