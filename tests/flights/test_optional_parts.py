@@ -13,13 +13,16 @@ from companion.analysis.summary import summarise
 from companion.config.document import ConfigError
 from companion.config.loader import logged_flight
 from companion.core.flight_core import FlightCore
-from companion.model.types import OperatorCommand, Outcome, PhaseKind
+from companion.model.types import Outcome, PhaseKind
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
+from tests.flights.ends import flown_until
 from tests.machines import overrides_with_joints
 from tests.support import CATCH, HOVER, LOW_HOVER, SHORT_CATCH
+
+pytestmark = pytest.mark.usefixtures("short_wait")
 
 NO_FORCE, NO_TETHER, NO_TOOL = "vehicle.devices.force=null", "vehicle.tether=null", "vehicle.tool=null"
 NO_PART = (NO_FORCE, NO_TETHER, NO_TOOL, "mission.catch=null")
@@ -39,6 +42,8 @@ def test_the_catch_is_flown_without_the_part(absent: str) -> None:
     felt = [] if absent == NO_FORCE else ["catch"]
     assert _reported(result) == ["takeoff", *felt, "touchdown"]
     assert all((i.force is None) is (absent == NO_FORCE) for i in result.inputs[-100:])
+    assert all((o.tether is None) is (absent == NO_TETHER) for o in result.outputs[-100:])
+    assert absent != NO_TETHER or all(truth.tether_tension_n == 0.0 for truth in result.truth)
     worst_m = max(
         math.dist(truth.position_world_m, o.reference.position_world_m)
         for truth, o in zip(result.truth, result.outputs, strict=True)
@@ -47,15 +52,6 @@ def test_the_catch_is_flown_without_the_part(absent: str) -> None:
     assert worst_m < 0.06
     again = FlightCore(logged_flight(flight.config.flight.model_dump_json()))
     assert all(again.step(i) == o for i, o in zip(result.inputs[:1500], result.outputs, strict=False)), "replay"
-
-
-def test_without_a_tether_a_commanded_landing_and_a_gust_are_flown() -> None:
-    gust = "world.faults=[{kind: gust, t_s: 4.5, duration_s: 0.5, size: 2.0}]"
-    result = FastFlight(load_sitl(SHORT_CATCH, overrides=[NO_TETHER, gust]), {5.0: OperatorCommand.LAND}).run()
-    assert result.outputs[-1].outcome is Outcome.ABORTED
-    assert not result.crashed
-    assert all(o.tether is None for o in result.outputs)
-    assert all(truth.tether_tension_n == 0.0 for truth in result.truth)
 
 
 def test_without_all_three_the_path_is_flown_nothing_is_thrown_and_there_is_a_report(
@@ -119,17 +115,20 @@ def test_without_a_force_sensor_the_momentum_observer_detects_the_catch() -> Non
 
 def test_the_momentum_observer_takes_no_wind_for_a_catch() -> None:
     gust = "world.faults=[{kind: gust, t_s: 4.5, duration_s: 0.5, size: 3.0}]"
-    result = FastFlight(load_sitl(SHORT_CATCH, overrides=[OBSERVER, gust, "world.payload_kg=0"])).run()
-    assert _reported(result) == ["takeoff", "touchdown"]
+    flight = FastFlight(load_sitl(SHORT_CATCH, overrides=[OBSERVER, gust, "world.payload_kg=0"]))
+    result = flown_until(flight, lambda o: o.phase_kind is PhaseKind.LANDING)
+    assert _reported(result) == ["takeoff"]
     controls = [o.control for o in result.outputs if o.control is not None]
     assert any(c.force_measured_world_n is not None for c in controls), "the sensor is logged beside the observer"
 
 
 def test_with_the_momentum_observer_a_jammed_tether_is_taut_and_no_catch() -> None:
     jam = "world.faults=[{kind: tether_taut, t_s: 8.0, size: 0.05}]"
-    result = FastFlight(load_sitl(CATCH, overrides=[NO_FORCE, OBSERVER, jam, "world.payload_kg=0"])).run()
+    flight = FastFlight(load_sitl(CATCH, overrides=[NO_FORCE, OBSERVER, jam, "world.payload_kg=0"]))
+    noticed = {"tether_taut", "tether_snagged"}
+    result = flown_until(flight, lambda o: any(event.id in noticed for event in o.events))
     reported = _reported(result)
-    assert "tether_taut" in reported or "tether_snagged" in reported
+    assert noticed & set(reported)
     assert "catch" not in reported
     assert not result.crashed
 
