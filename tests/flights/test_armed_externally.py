@@ -1,72 +1,45 @@
-"""Launcher, flight and guardian die together in the air, or flight and guardian hang, over real wires; a new `companion fly` finds what
-they left.
-"""
+"""Flight and guardian hang together in the air, over real wires; a new `companion fly` finds what they left."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import signal
-import subprocess
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_LOST
 from companion.model.types import AutopilotRequest
-from tests.support import HOVER, Running, Sandbox, World, read_summary, set_options, wait_until
+from tests.support import HOVER, Sandbox, World, read_summary, set_options, wait_until
 
-LONG = set_options(
-    **{"mission.phases[1].duration_s": 40.0, "mission.phases[0].height_m": 1.2, "mission.phases[0].duration_s": 3.0}
-)
+HIGH = set_options(**{"mission.phases[0].height_m": 1.2, "mission.phases[0].duration_s": 3.0})
 SLOW = "world.px4_params={MPC_LAND_SPEED: 0.3}"
 """PX4's own landing takes longer than a busy computer takes to start the next companion."""
-IN_FLIGHT = "  hold\n"
-
-
-def kill_the_companion(sandbox: Sandbox, first: Running) -> None:
-    """Launcher, flight and guardian at once, as when the computer goes down; the recorder with them."""
-    names = ("companion.flight.main", "companion.guardian", "companion.recorder.main")
-    pids = [first.process.pid, *(sandbox.pid_of(name) for name in names)]
-    for pid in pids:
-        os.kill(pid, signal.SIGSTOP)  # none of them may react to another's end
-    for pid in pids:
-        os.kill(pid, signal.SIGKILL)
-    first.process.wait()
-
-
-def fly_until_hover(sandbox: Sandbox, world: World, options: Sequence[str]) -> None:
-    with sandbox.start("fly", HOVER, "--out", "first", *options, *world.addresses()) as first:
-        first.wait_for(IN_FLIGHT)
-        kill_the_companion(sandbox, first)
 
 
 def ids(summary: dict[str, Any]) -> list[str]:
     return [event["id"] for event in summary["events"]]
 
 
-class Paused:
-    """The world stands still: PX4, physics and all, while a companion starts. It goes on when that companion speaks to PX4."""
-
-    def __init__(self, world: World) -> None:
-        self._process: subprocess.Popen[bytes] = world.process
-
-    def __enter__(self) -> None:
-        self._process.send_signal(signal.SIGSTOP)
-
-    def __exit__(self, *_: object) -> None:
-        self._process.send_signal(signal.SIGCONT)
-
-
-def test_started_again_in_the_air_without_the_arm_it_lands_what_it_finds(sandbox: Sandbox) -> None:
-    """With the arm: tests/core/test_armed_externally.py."""
+def test_hung_beside_a_hung_guardian_and_started_again_without_the_arm_it_lands_what_it_finds(sandbox: Sandbox) -> None:
+    """The launcher kills both and reports it. With the arm: tests/core/test_armed_externally.py."""
     with World(sandbox, HOVER, ["world.payload_kg=0", SLOW]) as world:
-        fly_until_hover(sandbox, world, LONG)
+        with sandbox.start("fly", HOVER, "--out", "first", *HIGH, *world.addresses()) as first:
+            first.wait_for("  hold\n")
+            for name in ("guardian.pid", "flight.pid"):
+                os.kill(int((sandbox.cwd / "first" / name).read_text()), signal.SIGSTOP)
+            # The world, PX4, physics and all, stands still until the next companion speaks to PX4.
+            world.process.send_signal(signal.SIGSTOP)
+            hung = first.end()
+        assert hung.code == EXIT_LOST, (hung.out, hung.err)
+        assert "flight: the flight process sent nothing for 5 s and was killed" in hung.err
+        assert "guardian: the guardian process hung and was killed" in hung.err
+        assert read_summary(sandbox.cwd / "first")["outcome"] == "lost"
         # Limp, the arm may hang past its walls, and then its edge refuses it.
         walls = set_options(**{"vehicle.arm.joints[1].angle_deg": [-170.0, 150.0]})
         addresses = world.addresses(arm={"port": "/dev/pts/none"})
-        with Paused(world), sandbox.start("fly", HOVER, "--out", "second", *walls, *addresses) as second:
+        with sandbox.start("fly", HOVER, "--out", "second", *walls, *addresses) as second:
             flight_pid = sandbox.cwd / "second/flight.pid"
             wait_until(flight_pid.exists, lambda: "no flight process")
             pid = int(flight_pid.read_text())
@@ -87,24 +60,6 @@ def test_started_again_in_the_air_without_the_arm_it_lands_what_it_finds(sandbox
         assert any(i.mocap is not None for i in log.inputs) and all(o.mocap_trusted for o in log.outputs)
         assert world.armings == 1 and not world.crashes
         wait_until(lambda: at_rest(world), lambda: str(world.messages[-3:]))
-    sandbox.assert_nobody_left()
-
-
-def test_hung_beside_a_hung_guardian_px4_lands_it(sandbox: Sandbox) -> None:
-    """The launcher kills both and reports it."""
-    with World(sandbox, HOVER, ["world.payload_kg=0"]) as world:
-        with sandbox.start("fly", HOVER, "--out", "first", *world.addresses()) as first:
-            first.wait_for(IN_FLIGHT)
-            for name in ("guardian.pid", "flight.pid"):
-                os.kill(int((sandbox.cwd / "first" / name).read_text()), signal.SIGSTOP)
-            ended = first.end()
-        assert ended.code == EXIT_LOST, (ended.out, ended.err)
-        assert "flight: the flight process sent nothing for 5 s and was killed" in ended.err
-        assert "guardian: the guardian process hung and was killed" in ended.err
-        assert read_summary(sandbox.cwd / "first")["outcome"] == "lost"
-        wait_until(lambda: at_rest(world), lambda: str(world.messages[-3:]))
-        assert not world.crashes
-        assert world.armings == 1
     sandbox.assert_nobody_left()
 
 
