@@ -67,12 +67,9 @@ LANDED_M = 0.4
 """Of the body's origin, which stands 0.3 m high."""
 
 
-def faults(*kinds: str, on_stub: str | None) -> pytest.MarkDecorator:
-    """Every fault on the real PX4; on the stub one or none of them, since its guardian is the same in every test."""
-    cases = [pytest.param("px4", kind, marks=REAL) for kind in kinds]
-    if on_stub is not None:
-        cases.insert(0, pytest.param("stub", on_stub))
-    return pytest.mark.parametrize(("autopilot", "kind"), cases)
+def faults(*kinds: str) -> pytest.MarkDecorator:
+    """Every fault on the real PX4. On the stub one of them, since its guardian is the same in every test: test_lockstep.py."""
+    return pytest.mark.parametrize(("autopilot", "kind"), [pytest.param("px4", kind, marks=REAL) for kind in kinds])
 
 
 def event_ids(summary: dict[str, Any]) -> list[str]:
@@ -109,7 +106,7 @@ def test_the_catch(sandbox: Sandbox, autopilot: str) -> None:
     assert summary["rms"]["post"]["e_q_deg"] < E_Q_MAX_DEG
 
 
-@faults("kill_flight", "stop_flight", on_stub=None)
+@faults("kill_flight", "stop_flight")
 def test_the_guardian_lands_after_the_catch(sandbox: Sandbox, autopilot: str, kind: str) -> None:
     fault = f"world.faults=[{{kind: {kind}, after: catch, t_s: 0.1}}]"
     ended = sandbox.run("fly", SHORT_CATCH, f"--sitl={autopilot}", "--out", "out", "--set", fault)
@@ -133,7 +130,7 @@ def assert_landed_by_the_guardian(sandbox: Sandbox, ended: Ended, kind: str) -> 
     assert_stopped_as_modelled(sandbox, kind)
 
 
-@faults("kill_flight", "stop_flight", on_stub=None)
+@faults("kill_flight", "stop_flight")
 def test_the_guardian_stops_before_the_wall(sandbox: Sandbox, autopilot: str, kind: str) -> None:
     """The fastest line to the wall that the mission check accepts, and the fault where the predicted stop is nearest to it."""
     fault = f"world.faults=[{{kind: {kind}, t_s: {NEAREST_STOP_S}}}]"
@@ -159,7 +156,7 @@ def assert_stopped_as_modelled(sandbox: Sandbox, kind: str) -> None:
     assert fault["worst_tilt_deg"] < 30.0
 
 
-@faults("kill_flight", "hold_gil", on_stub="hold_gil")
+@faults("kill_flight", "hold_gil")
 def test_with_setpoints_straight_onto_the_link_the_guardian_lands_as_well(
     sandbox: Sandbox, autopilot: str, kind: str
 ) -> None:
