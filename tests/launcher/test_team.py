@@ -17,7 +17,7 @@ from companion.launcher.team import BAR_FILE
 from companion.model.codec import from_jsonable
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK, EXIT_REFUSED
 from tests.flights.test_px4 import REAL
-from tests.support import PREFLIGHT, ROOT, Sandbox, read_summary, run_here, set_options
+from tests.support import PREFLIGHT, ROOT, Sandbox, hooked, read_summary, run_here, sandbox_in, set_options
 
 TEAM = ROOT / "configs/teams/carry.yaml"
 SHORT = {
@@ -31,13 +31,15 @@ SHORT = {
     "mission.phases[0].duration_s": 1.3,
     "mission.phases[1].lower_s": 0.9,
     "mission.phases[2].lift_m": 0.15,
-    "mission.phases[2].lift_s": 1.8,
+    "mission.phases[2].lift_s": 1.4,
     "mission.phases[2].waypoints": [{"position_m": [-0.9, 0.0], "duration_s": 0.8}],
     "mission.phases[3].rise_m": 0.1,
     "mission.phases[3].rise_s": 0.8,
-    "mission.phases[3].apart_m": 0.5,
-    "mission.phases[3].apart_s": 1.8,
+    "mission.phases[3].apart_m": 0.35,
+    "mission.phases[3].apart_s": 1.4,
     "mission.phases[4].speed_m_s": 0.6,
+    "left.mission.start.position_m": [-1.0, 1.25],
+    "right.mission.start.position_m": [-1.0, -1.25],
 }
 """The bar is lifted, moved by 0.1 m and set down. With a turn, and with what happens on the way: tests/sitl/test_pair.py."""
 FAST = set_options(**{PREFLIGHT: 1.0, "vehicle.ground.mqtt": None}, **SHORT)
@@ -165,27 +167,49 @@ def summary_in(out: Path) -> dict[str, Any]:
     return summary
 
 
-def flight_of(out: Path, end: str) -> int:
-    return int((out / end / "flight.pid").read_text())
-
-
-def test_a_killed_flight_process_is_landed_by_its_guardian_and_the_other_one_by_ctrl_c(sandbox: Sandbox) -> None:
-    """The other one hears the guardian until it ends. Killed while they carry, it lands both: tests/sitl/test_pair.py."""
-    with sandbox.start(*FLY, "--no-report") as running:
-        running.wait_for("take-off\n")
-        os.kill(flight_of(sandbox.cwd / "out", "right"), signal.SIGKILL)
-        running.wait_for("nothing from the other vehicle")
-        assert "on the ground and disarmed" in running.out
-        running.signal(signal.SIGINT)
-        ended = running.end()
-    sandbox.assert_nobody_left()
-    summary = summary_in(sandbox.cwd / "out")
+def test_a_member_whose_flight_process_dies_is_landed_by_its_guardian_and_the_other_one_by_ctrl_c(
+    tmp_path: Path,
+) -> None:
+    """It dies of an error in the core. The other one hears the guardian until it ends. Killed while they carry, it lands both:
+    tests/sitl/test_pair.py.
+    """
+    (tmp_path / "sitecustomize.py").write_text(_RIGHT_BREAKS, encoding="utf-8")
+    slowly = set_options(**{"mission.phases[0].duration_s": 5.0})
+    with sandbox_in(tmp_path / "sandbox", hooked(tmp_path)) as sandbox:
+        with sandbox.start(*FLY, "--no-report", *slowly) as running:
+            running.wait_for("nothing from the other vehicle")
+            assert "on the ground and disarmed" in running.out
+            running.signal(signal.SIGINT)
+            ended = running.end()
+        sandbox.assert_nobody_left()
+        summary = summary_in(sandbox.cwd / "out")
+        written = (sandbox.cwd / "out/right/flight.log").read_text(encoding="utf-8")
     assert {end: member["outcome"] for end, member in summary["members"].items()} == {
         "left": "aborted",
         "right": "aborted",
     }
     assert ended.code == EXIT_ABORTED
-    assert "right: flight: the flight process was ended by SIGKILL; the guardian landed the vehicle" in ended.err
+    died = "right: flight: the flight process ended with exit code 70 (ZeroDivisionError: a bug); the guardian landed the vehicle"
+    assert died in ended.err
+    assert "Traceback" in written
+    assert summary["members"]["right"]["events"][-1]["id"] == "guardian_landed"
+
+
+_RIGHT_BREAKS = """
+import sys
+
+if "companion.flight.main" in sys.orig_argv and "out/right" in " ".join(sys.orig_argv):
+    import companion.core.flight_core
+
+    class Breaking(companion.core.flight_core.FlightCore):
+        def step(self, inputs):
+            outputs = super().step(inputs)
+            if outputs.mission_t_s > 0.3:
+                raise ZeroDivisionError("a bug")
+            return outputs
+
+    companion.core.flight_core.FlightCore = Breaking
+"""
 
 
 def test_a_member_that_is_refused_keeps_the_other_on_the_ground(sandbox: Sandbox) -> None:
@@ -202,7 +226,7 @@ def test_a_member_that_is_refused_keeps_the_other_on_the_ground(sandbox: Sandbox
 
 def test_without_its_world_a_team_is_lost_and_nothing_is_left(sandbox: Sandbox) -> None:
     with sandbox.start(*FLY, "--no-report") as running:
-        running.wait_for("offboard\n")
+        running.wait_for("wait\n")
         os.kill(sandbox.pid_of("sitl"), signal.SIGKILL)
         ended = running.end()
     sandbox.assert_nobody_left()
