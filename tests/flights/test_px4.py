@@ -343,13 +343,3 @@ def test_a_name_that_is_no_px4_refuses_the_flight_in_one_line(tmp_path: Path) ->
     assert ended.code == EXIT_REFUSED
     assert len(ended.err_lines) == 1, ended.err
     assert ended.err.startswith(f"sitl: {VARIABLE}=")
-
-
-def test_a_fault_of_the_stub_refuses_the_flight_in_one_line(tmp_path: Path) -> None:
-    fault = "world.faults=[{kind: arming_refused, t_s: 1}]"
-    with sandbox_in(tmp_path / "sandbox", {VARIABLE: ""}) as sandbox:
-        ended = sandbox.run("fly", HOVER, "--sitl=px4", "--out", "out", "--set", fault)
-        sandbox.assert_nobody_left()
-    assert ended.code == EXIT_REFUSED
-    assert len(ended.err_lines) == 1, ended.err
-    assert "arming_refused" in ended.err and "run with --sitl" in ended.err

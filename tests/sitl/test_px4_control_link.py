@@ -104,6 +104,8 @@ def test_the_geometry_is_that_of_the_world_and_that_of_a_hexacopter_that_of_px4s
 
 def test_every_other_fault_is_flown() -> None:
     refuse_stub_only_settings(World(faults=(Fault(kind="link_delay", t_s=1.0), Fault(kind="kill_flight", t_s=1.0))))
+    with pytest.raises(Px4Error, match=r"arming_refused .*run with --sitl"):
+        refuse_stub_only_settings(World(faults=(Fault(kind="arming_refused", t_s=1.0),)))
     with pytest.raises(Px4Error, match="battery_start"):
         refuse_stub_only_settings(World(battery_start=0.5))
     sag = Fault(kind="battery_sag", t_s=1.0)
