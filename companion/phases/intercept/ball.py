@@ -46,6 +46,8 @@ COAST_S: Final = 0.06
 """Time after which a candidate that is not seen any more is dropped."""
 BALL_COAST_S: Final = 0.25
 """The same for a ball, which hides behind the net or the vehicle."""
+HORIZON_S: Final = 1.5
+"""Longest time for which a ball's path is predicted."""
 STEP_S: Final = 0.01
 """Time between the points of a predicted path."""
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from enum import Enum
-from functools import partial
+from collections.abc import Iterator
 from itertools import product
 from typing import Annotated, Any, ClassVar, Final, Literal
 
@@ -17,23 +15,21 @@ from companion.config.phase import Duration
 from companion.control.arm_model import manipulator_of
 from companion.mission.air import Air, Expectation
 from companion.mission.phase import Checking, Phase, Planning
-from companion.model.codec import Record
 from companion.model.markers import BallState
 from companion.model.outputs import ChaseState
 from companion.model.types import Reference, SafetyAction, Severity, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate, Point
-from companion.phases.intercept.meeting import FROZEN_S, RISES_S, Lag, Plan, Reach, meetings, reach_of
-from companion.phases.intercept.motion import Bounds, Motion, State, motion_to
+from companion.phases.intercept.choice import BALL_M, chosen, now_s, push_of, reach, room_of_plan_m
+from companion.phases.intercept.meeting import FROZEN_S, RISES_S, Plan, meetings
+from companion.phases.intercept.motion import Bounds, State, motion_to
 from companion.phases.intercept.net import beside_m, net_m, opening
-from companion.phases.intercept.rotors import clearance_m, places_body_m
+from companion.phases.intercept.state import PUSHED, Interception, Mode
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 
 ASTRAY_M: Final = 0.3
 """Distance from the planned meeting point beyond which a ball is another one."""
-HORIZON_S: Final = 1.5
-"""Longest time for which a ball's path is predicted."""
 AMISS: Final = 0.5
 """Share of the net's deviation from the assumed response that is expected to be left at the meeting."""
 REST_S: Final = 1.0
@@ -44,16 +40,6 @@ FLOOR_M: Final = 0.1
 """Smallest height of the net above the floor in the box."""
 TRACKING_M: Final = 0.1
 """Distance from the limits of room and tether in the box."""
-BALL_M: Final = 0.05
-"""Distance of its centre from the rotor disks at which a ball passes them; it may be this large."""
-
-DODGE_STEP_S, DODGE_STEPS = 0.06, 6
-"""Steps in which it is looked what the limits leave of a dodge."""
-JUDGED_S: Final = 0.04
-"""Time between two choices of what to do about a ball that comes to the rotors."""
-BETTER_M: Final = 0.005
-"""Room at the rotors by which a dodge must be better than what the vehicle would do else."""
-
 _NOMINAL: Final = SafetyAction.NOMINAL
 BALL_SEEN = EventDefinition("ball_seen", Severity.INFO, _NOMINAL, "a marker falls freely: it is a ball in flight")
 MEETING_PLANNED = EventDefinition(
@@ -66,12 +52,6 @@ BALL_OUT_OF_REACH = EventDefinition(
     "ball_out_of_reach", Severity.INFO, _NOMINAL,
     "a ball has passed that could not be met within the box and the limits; the text gives its distance from the net",
 )  # fmt: skip
-BALL_AT_ROTORS = EventDefinition(
-    "ball_at_rotors",
-    Severity.WARNING,
-    _NOMINAL,
-    "a ball comes to the rotor disks: the vehicle does what leaves it the most room",
-)
 BALL_LOST = EventDefinition(
     "ball_lost",
     Severity.INFO,
@@ -79,65 +59,6 @@ BALL_LOST = EventDefinition(
     "a ball that was to be met is not seen any more, or does not fall: the vehicle stops",
 )
 NO_BALL = EventDefinition("no_ball", Severity.INFO, _NOMINAL, "no ball came within `wait_max_s`: the plan goes on")
-
-
-class Mode(Enum):
-    """What the vehicle does."""
-
-    WAIT = "wait"
-    CHASE = "chase"  # move to the meeting point
-    DODGE = "dodge"  # move aside for a ball that comes to the rotors
-    STOP = "stop"  # come to rest after the meeting, and stay
-    RETURN = "return"  # move back to where it waited
-
-    # An enum's own hash is a Python function.
-    __hash__ = object.__hash__
-
-
-_PUSHED = (Mode.CHASE, Mode.DODGE)
-"""Modes in which the reference is pushed from tick to tick."""
-
-
-class Dodge(Record, frozen=True):
-    """How the vehicle moves aside."""
-
-    push_m_s2: Vec3
-    """Acceleration of the reference."""
-    until_s: float
-    """Time at which the ball is nearest."""
-
-
-class Interception(Record, frozen=True, kw_only=True):
-    """The state in the air."""
-
-    mode: Mode
-    begun_s: float
-    home: Reference
-    """The plan's reference, at rest."""
-    now: State
-    """Motion of the reference in this tick."""
-    lag: Lag = Lag()
-    """The reference's lagging acceleration."""
-    motion: Motion | None = None
-    """Motion that is flown; None while waiting, during a chase, and before a stop is planned."""
-    plan: Plan | None = None
-    """Way to the meeting that was planned last."""
-    dodge: Dodge | None = None
-    """The way aside that was begun last."""
-    candidates: tuple[Candidate, ...] = ()
-    frame_number: int = -1
-    beside_m: Vec3 = (0.0, 0.0, 0.0)
-    """Mean position of the net minus that of its reference."""
-    chase: ChaseState | None = None
-    """Figures of `plan` for the log; None before the first plan."""
-    passing_m: float | None = None
-    """Smallest distance from the waiting net of the ball that is seen; None if none is seen."""
-    seen: bool = False
-    """Whether a ball was seen since the start."""
-    judged_s: float = -math.inf
-    """When it was last chosen what to do about a ball that comes to the rotors."""
-    at_rotors: bool = False
-    """Whether the ball that is seen flies through the rotor disks."""
 
 
 class Intercept(Phase):
@@ -191,7 +112,12 @@ class Intercept(Phase):
     def begin(self, air: Air) -> Interception:
         """Return the state at the start."""
         home = air.plan_reference()
-        return Interception(mode=Mode.WAIT, begun_s=air.t_s, home=home, now=State(*_motion(home)))
+        return Interception(
+            mode=Mode.WAIT,
+            begun_s=air.t_s,
+            home=home,
+            now=State(home.position_world_m, home.velocity_world_m_s, home.acceleration_world_m_s2),
+        )
 
     def step(self, air: Air, own: Any) -> Interception | None:
         """Return the state after one tick; None when the vehicle is back, or no ball has come."""
@@ -210,9 +136,9 @@ class Intercept(Phase):
             s = replace(s, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
         if s.mode is Mode.WAIT:
             return self._waited(air, s, new)
-        if s.mode in _PUSHED:
+        if s.mode in PUSHED:
             s = self._pushed(air, self._chased(air, s, new) if s.mode is Mode.CHASE else self._dodged(air, s, new))
-            if s.mode in _PUSHED:
+            if s.mode in PUSHED:
                 return s
         if s.motion is None:
             motion = self._bounds(air, s).stop(air.t_s - air.dt_s, s.now)
@@ -299,7 +225,7 @@ class Intercept(Phase):
                 left_s, away_m = plan.point.t_s - air.t_s, math.dist(plan.point.position_m, net)
                 air.report(MEETING_PLANNED, f"meets the ball in {left_s:.2f} s, {away_m:.2f} m from the waiting net")
                 return self._pushed(air, _planned(replace(s, mode=Mode.CHASE), plan, left_s))
-            s = self._pushed(air, self._avoided(air, s, path, self._clearance_m(air, s, path, None)))
+            s = self._pushed(air, chosen(air, s, self._bounds(air, s), path))
             if s.mode is not Mode.WAIT:
                 return s
         return s
@@ -329,7 +255,7 @@ class Intercept(Phase):
         plan = self._meeting(air, s, path, point.t_s)
         if plan is not None:
             return _planned(s, plan, plan.point.t_s - air.t_s)
-        return self._avoided(air, s, path, self._clearance_m(air, s, path, s.plan))
+        return chosen(air, s, self._bounds(air, s), path)
 
     def _dodged(self, air: Air, s: Interception, new: bool) -> Interception:
         """Return the state of a dodge with what the newest frame shows."""
@@ -342,72 +268,27 @@ class Intercept(Phase):
         """Return the state of a vehicle that does not chase, after it has looked for balls that come to the rotors."""
         for candidate in s.candidates:
             if candidate.is_ball:
-                path = self._path(air, s, candidate)
-                s = self._avoided(air, s, path, self._room_m(air, s, path, self._push(air, s)))
+                s = chosen(air, s, self._bounds(air, s), self._path(air, s, candidate))
         return s
-
-    def _avoided(self, air: Air, s: Interception, path: list[Point], kept_m: float) -> Interception:
-        """Return the state that leaves a ball the most room at the rotors: this one, a stop, or a dodge.
-
-        Args:
-            kept_m: smallest distance of the ball from the rotors if the vehicle goes on as it does.
-        """
-        if kept_m >= BALL_M or not path or air.t_s - s.judged_s < JUDGED_S:
-            return s
-        s = replace(s, judged_s=air.t_s)
-        bounds, stop_m = self._bounds(air, s), self._clearance_m(air, s, path, None)
-        rooms = []
-        for push in _aside(bounds, path):
-            steps = bounds.pushes(air.t_s, s.now, partial(_stepped, air.t_s, [push]), DODGE_STEP_S, DODGE_STEPS)
-            rooms.append((self._room_m(air, s, path, partial(_stepped, air.t_s, steps)), push))
-        room_m, push = max(rooms)
-        if not s.at_rotors:
-            does = "moves aside" if room_m > max(kept_m, stop_m) + BETTER_M else "stops" if stop_m > kept_m else "stays"
-            air.report(
-                BALL_AT_ROTORS, f"a ball comes within {max(0.0, kept_m):.2f} m of the rotor disks; the vehicle {does}"
-            )
-            s = replace(s, at_rotors=True)
-        if room_m > max(kept_m, stop_m) + BETTER_M:
-            body_m = s.now.position_m
-            nearest = min(path, key=lambda point: math.dist(point.position_m, body_m))
-            return replace(s, mode=Mode.DODGE, motion=None, dodge=Dodge(push, nearest.t_s))
-        if stop_m > kept_m and s.mode in _PUSHED:
-            return replace(s, mode=Mode.STOP)
-        return s
-
-    def _push(self, air: Air, s: Interception) -> Callable[[float], Vec3]:
-        """Return the acceleration of the reference at a time, if the vehicle goes on as it does."""
-        if s.mode is Mode.CHASE and s.plan is not None:
-            return partial(s.plan.push_m_s2, drop_m=self._reach(air, s).drop_m)
-        if s.mode is Mode.DODGE and s.dodge is not None:
-            return partial(_stepped, air.t_s, [s.dodge.push_m_s2])
-        return partial(_stepped, air.t_s, _REST) if s.motion is None else partial(_acceleration_m_s2, s.motion)
 
     def _pushed(self, air: Air, s: Interception) -> Interception:
         """Return the state of a chase or a dodge after this tick."""
-        if s.mode not in _PUSHED:
+        if s.mode not in PUSHED:
             return s
         bounds = self._bounds(air, s)
-        now = bounds.pushed(air.t_s, s.now, air.dt_s, self._push(air, s)(air.t_s))
+        now = bounds.pushed(air.t_s, s.now, air.dt_s, push_of(air, s)(air.t_s))
         if now is None:
             return replace(s, mode=Mode.STOP)
         return replace(s, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
 
     def _path(self, air: Air, s: Interception, candidate: Candidate) -> list[Point]:
         floor_m = self._net(air, s)[2] - self.box_m[2]
-        return ball.path(candidate, air.t_s + HORIZON_S, floor_m, self.drag_per_m)
-
-    def _now_s(self, air: Air, s: Interception) -> float:
-        """Return the time of the reference's motion: in a chase it is that of the last tick until this one has pushed it."""
-        return air.t_s - air.dt_s if s.mode in _PUSHED else air.t_s
+        return ball.path(candidate, air.t_s + ball.HORIZON_S, floor_m, self.drag_per_m)
 
     def _net(self, air: Air, s: Interception) -> Vec3:
         """Return the waiting net's centre, world frame."""
         (x, y, z), (bx, by, bz), (px, py, pz) = net_m(air.manipulator, s.home), s.beside_m, s.home.position_world_m
         return (px + x + bx, py + y + by, pz + z + bz)
-
-    def _reach(self, air: Air, s: Interception) -> Reach:
-        return reach_of(-net_m(air.manipulator, s.home)[2], HORIZON_S)
 
     def _bounds(self, air: Air, s: Interception) -> Bounds:
         return Bounds(air.vehicle, air.limits, air.safe, s.home.position_world_m, self.box_m)
@@ -417,7 +298,7 @@ class Intercept(Phase):
         tip, (px, py, pz), (u, v, w) = (
             air.tip_world_m(),
             s.now.position_m,
-            s.lag.net_m(self._reach(air, s).drop_m, (x, y)),
+            s.lag.net_m(reach(air, s).drop_m, (x, y)),
         )
         if tip is not None and s.mode is Mode.CHASE:
             bx += AMISS * (tip[0] - px - x - bx - u)
@@ -425,40 +306,17 @@ class Intercept(Phase):
             bz += AMISS * (tip[2] - pz - z - bz - w + RISES_S * s.now.velocity_m_s[2])
         net, bounds = (x + bx, y + by, z + bz), self._bounds(air, s)
         plans = meetings(
-            self._now_s(air, s),
+            now_s(air, s),
             s.now,
             s.lag,
             path,
             net,
             opening(air.manipulator, s.home),
             bounds,
-            self._reach(air, s),
+            reach(air, s),
             kept_s,
         )
-        return next((plan for plan in plans if self._clears(air, s, path, plan)), None)
-
-    def _clears(self, air: Air, s: Interception, path: list[Point], plan: Plan | None) -> bool:
-        """Return whether a ball flies clear of the rotors before it is met; without a plan, those of the waiting vehicle."""
-        return self._clearance_m(air, s, path, plan) >= BALL_M
-
-    def _clearance_m(self, air: Air, s: Interception, path: list[Point], plan: Plan | None) -> float:
-        """Return the smallest distance of a ball from the rotors before it is met; without a plan, if the vehicle stops."""
-        if plan is None:
-            push: Callable[[float], Vec3] = partial(
-                _acceleration_m_s2, self._bounds(air, s).stop(self._now_s(air, s), s.now)
-            )
-        else:
-            wanted = partial(plan.push_m_s2, drop_m=self._reach(air, s).drop_m)
-            count = max(1, math.ceil((plan.point.t_s - air.t_s) / DODGE_STEP_S))
-            steps = self._bounds(air, s).pushes(air.t_s, s.now, wanted, DODGE_STEP_S, count)
-            push = partial(_stepped, air.t_s, steps)
-            path = [point for point in path if point.t_s <= plan.point.t_s]
-        return self._room_m(air, s, path, push)
-
-    def _room_m(self, air: Air, s: Interception, path: list[Point], push: Callable[[float], Vec3]) -> float:
-        """Return the smallest distance of a ball from the rotors of a vehicle whose reference accelerates like this."""
-        places = places_body_m(air.i.vehicle, s.home.yaw_rad, self._now_s(air, s), s.now, s.lag, path, push)
-        return clearance_m(air.vehicle.airframe, places)
+        return next((plan for plan in plans if room_of_plan_m(air, s, bounds, path, plan) >= BALL_M), None)
 
 
 def _planned(s: Interception, plan: Plan, left_s: float) -> Interception:
@@ -467,28 +325,3 @@ def _planned(s: Interception, plan: Plan, left_s: float) -> Interception:
     predicted_s, replans = (left_s, 0) if before is None else (before.predicted_s, before.replans + 1)
     chase = ChaseState(predicted_s=predicted_s, replans=replans, relative_speed_m_s=speed_m_s)
     return replace(s, plan=plan, chase=chase)
-
-
-def _aside(bounds: Bounds, path: list[Point]) -> list[Vec3]:
-    """Return the accelerations of the dodges that are tried: to both sides of the ball's way, along it and against it, up and down."""
-    x, y, _ = path[0].velocity_m_s
-    most = bounds.acceleration_m_s2 / max(1e-6, math.hypot(x, y))
-    x, y, up = most * x, most * y, bounds.acceleration_m_s2
-    tried = [(-y, x, 0.0), (y, -x, 0.0), (x, y, 0.0), (-x, -y, 0.0), (0.0, 0.0, up), (0.0, 0.0, -up)]
-    return [bounds.within(push) for push in tried]
-
-
-_REST: list[Vec3] = [(0.0, 0.0, 0.0)]
-
-
-def _stepped(begin_s: float, steps_m_s2: list[Vec3], t_s: float) -> Vec3:
-    """Return the acceleration of a time in steps of `DODGE_STEP_S`; the last one lasts."""
-    return steps_m_s2[max(0, min(len(steps_m_s2) - 1, int((t_s - begin_s) / DODGE_STEP_S)))]
-
-
-def _acceleration_m_s2(motion: Motion, t_s: float) -> Vec3:
-    return motion.at(t_s).acceleration_m_s2
-
-
-def _motion(r: Reference) -> tuple[Vec3, Vec3, Vec3]:
-    return r.position_world_m, r.velocity_world_m_s, r.acceleration_world_m_s2
