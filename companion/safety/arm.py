@@ -46,9 +46,8 @@ CHANGE_HOLD_S: Final = 0.3
 CHANGE_ABOVE_M: Final = 0.1
 """Height above standing height from which the floor does not carry the vehicle."""
 CHANGE_CHASED_S: Final = 1.0
-"""Time after the accelerations of a chase until which the changes are not compared: while the vehicle swings, rotors and attitude lag, and
-its motion shows forces of several newtons that are none.
-"""
+"""Time after the accelerations of a chase from which the changes are compared again: while the vehicle swings, rotors and attitude lag,
+and its motion shows forces of several newtons that are none."""
 CHANGE_AGE_MAX_S: Final = 0.05
 """Age of a sample from which there is no measured force to compare."""
 _NO_FORCE: Vec3 = (0.0, 0.0, 0.0)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from companion.model.types import Event, Inputs, OperatorCommand, SafetyAction
-from companion.safety.arm import error_text
+from companion.safety.arm import ForceTracker, error_text
 from companion.safety.flight_context import FlightContext
 from companion.safety.monitors import Monitors
 from companion.safety.oscillation import Oscillation
@@ -28,7 +28,18 @@ from tests.safety.faults import (
     slow_link,
     swinging,
 )
-from tests.safety.healthy import START_S, TICK_S, after_a_moment, flying, healthy, put, standing, stopped, watched
+from tests.safety.healthy import (
+    START_S,
+    TICK_S,
+    after_a_moment,
+    control,
+    flying,
+    healthy,
+    put,
+    standing,
+    stopped,
+    watched,
+)
 
 
 def test_vision_that_has_never_been_fused_is_not_lost() -> None:
@@ -341,6 +352,22 @@ def test_swings_that_a_chase_causes_are_not_counted(chases: bool) -> None:
     context.chases = chases
     events = watched(VEHICLE, after_a_moment(FAULTS["oscillates"].change), context)
     assert [event.id for event in events] == ([] if chases else ["oscillates"])
+
+
+@pytest.mark.parametrize(("chased_s", "first_s"), [(0.0, 0.55), (2.0, 3.55)], ids=["no-chase", "chase"])
+def test_a_force_that_the_motion_does_not_show_is_judged_from_a_second_after_a_chase_on(
+    chased_s: float, first_s: float
+) -> None:
+    tracker = ForceTracker(VEHICLE.safety.force_stuck_s, 1.0, VEHICLE.airframe.ground_clearance_m)
+    context, found_s = (
+        flying(control=control(force_ext_world_n=(0.0, 0.0, 1.5)), disturbance_world_n=(0.0, 0.0, -1.5)),
+        [],
+    )
+    for k in range(1000):
+        context.chases = k * TICK_S < chased_s
+        tracker.update(healthy(k, k * TICK_S), context, k * TICK_S, TICK_S, moving=True)
+        found_s += [k * TICK_S] if tracker.off_n is not None else []
+    assert found_s[0] == pytest.approx(first_s, abs=0.03)
 
 
 @pytest.mark.parametrize(("late_s", "id_"), [(0.01, None), (0.03, "link_slow"), (0.06, "link_late")])
