@@ -8,7 +8,8 @@ pull along the line also has a horizontal part.
 
 Two facts distinguish the tether from wind. At the take-off the tether is slack, so that the mean residual, followed slowly, is wind and
 model error, and only what exceeds it can be a pull. And a line that pulls holds the vehicle: one that moves along the force, in either
-direction, is not held.
+direction, is not held. A force that motion has refuted is wind that goes on, or an error of the model that ends with the motion: the
+rest is a pull only if neither explains it.
 """
 
 from __future__ import annotations
@@ -53,6 +54,7 @@ class PullEstimate:
         "_min_n",
         "_moved_m",
         "_pull_s",
+        "_refuted",
         "_side_s",
         "pull_n",
         "pulling",
@@ -70,6 +72,8 @@ class PullEstimate:
         self._f: Vec3 = (0.0, 0.0, 0.0)
         self._ambient: Vec3 = (0.0, 0.0, 0.0)
         """Mean residual while nothing pulls."""
+        self._refuted: Vec3 = (0.0, 0.0, 0.0)
+        """What motion has refuted of late; it is part of `_ambient`, and fades."""
         self._learned_s = 0.0
         self._pull_s = self._side_s = 0.0
         self._moved_m = 0.0
@@ -107,7 +111,13 @@ class PullEstimate:
             self._ambient = (ax + gain * rx, ay + gain * ry, az + gain * rz)
         gain = dt_s / (self._filter_s + dt_s)
         fx, fy, fz = self._f
-        fx, fy, fz = self._f = (fx + gain * (rx - fx), fy + gain * (ry - fy), fz + gain * (rz - fz))
+        ux, uy, uz = fx + gain * (rx - fx), fy + gain * (ry - fy), fz + gain * (rz - fz)
+        self._f = (ux, uy, uz)
+        faded = max(0.0, 1.0 - dt_s / AMBIENT_S)
+        qx, qy, qz = self._refuted
+        self._refuted = qx, qy, qz = faded * qx, faded * qy, faded * qz
+        ends = (ux + qx) ** 2 + (uy + qy) ** 2 + (uz + qz) ** 2 < ux * ux + uy * uy + uz * uz
+        fx, fy, fz = (ux + qx, uy + qy, uz + qz) if ends else (ux, uy, uz)
         ux, uy, uz = towards_anchor
         weight = (ux * ux + uy * uy) * _FLAT + uz * uz * _STEEP
         if weight <= 0.0:
@@ -126,6 +136,7 @@ class PullEstimate:
             vx, vy, vz = velocity_world_m_s
             self._moved_m += dt_s * (vx * fx + vy * fy + vz * fz) / math.sqrt(side_2 + fz * fz)
             if not (self.pulling or self.sideways or -FREE_M < self._moved_m < FREE_M):
-                self._ambient = (ax + fx, ay + fy, az + fz)
+                (ax, ay, az), (fx, fy, fz), (qx, qy, qz) = self._ambient, self._f, self._refuted
+                self._ambient, self._refuted = (ax + fx, ay + fy, az + fz), (qx + fx, qy + fy, qz + fz)
                 self._f, self.pull_n = (0.0, 0.0, 0.0), 0.0
                 self._pull_s = self._side_s = 0.0

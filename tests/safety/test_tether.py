@@ -365,6 +365,27 @@ def test_a_vehicle_that_moves_along_a_force_is_not_held_by_a_line(speed_m_s: flo
     assert any(state.snagged for state in states) is held
 
 
+@pytest.mark.parametrize("size_n", [-9.0, -5.0, 5.0, 9.0])
+def test_an_error_that_ends_with_the_motion_that_refuted_it_leaves_no_pull(size_n: float) -> None:
+    """A vehicle that swings after a chase: errors of the thrust of 5 to 9 N along its motion, first one way, then the other."""
+    moves_s, force = 1.0, along(size_n)
+
+    def error(t_s: float, p: Vec3) -> Vec3:
+        return force(t_s, (0.5, 0.0, 1.0)) if t_s < moves_s else STILL
+
+    ways = towards((0.5, 0.0, 1.0))
+    watch, p = watch_of(vehicle()), (0.5, 0.0, 1.0)
+    for tick in range(-1200, 1000):
+        t_s = tick * DT_S
+        moves = 0.0 <= t_s < moves_s
+        v = (0.3 * ways[0], 0.3 * ways[1], 0.3 * ways[2]) if moves else STILL
+        state = watch.update(t_s, p, v, LEVEL, FOLDED, error(t_s, p) if t_s >= 0.0 else STILL, STILL)
+        assert not state.snagged, t_s
+    for tick in range(1000, 1400):
+        state = watch.update(tick * DT_S, p, STILL, LEVEL, FOLDED, along(12.0)(0.0, p), STILL)
+    assert state.snagged, "and a line that pulls afterwards is noticed"
+
+
 @pytest.mark.parametrize("anchor", [(0.0, -1.2, 0.0), (-1.1, 0.4, 0.3), (0.5, 0.1, 2.4)])
 def test_a_pull_comes_through_its_filter_and_counts_after_its_time_and_from_its_threshold_on(anchor: Vec3) -> None:
     """The threshold is 3 standard deviations of 0.7 N horizontally and 2 N vertically, and `pull_min_n` at least."""
