@@ -197,8 +197,9 @@ class FlightCore:
             context.found_armed = None
         context.tracking_error_m = self._control.tracking_error_m if stage is _MISSION else None
         context.control, context.disturbance_world_n = self._log, self._control.disturbance_world_n
-        context.chases = self._state.expected.chase is not None and _accelerates(self._reference)
-        context.contact_n, context.grip = self._state.expected.contact_n, self._state.grip
+        expected = self._state.expected
+        context.chases = (expected.chase or expected.ball) is not None and _accelerates(self._reference)
+        context.contact_n, context.grip = expected.contact_n, self._state.grip
         context.waiting = stage is Stage.WAIT and bool(missing_inputs(inputs, self._vehicle))
         armed_by_others = stage in seq.BEFORE_ARMING and seq.is_armed(inputs.status)
         if armed_by_others:

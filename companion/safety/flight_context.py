@@ -42,7 +42,7 @@ class FlightContext:
     grip: Grip = Grip.FREE
     """What the vehicle has in its clamp."""
     chases: bool = False
-    """The reference chases a ball: its accelerations swing the vehicle to and fro."""
+    """The reference chases a ball, or moves aside for one: its accelerations swing the vehicle to and fro."""
     waiting: bool = False
     """Inputs are still missing on the ground: only rules with `while_waiting` are evaluated."""
 

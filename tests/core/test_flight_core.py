@@ -14,6 +14,7 @@ from companion.control.types import Tuning
 from companion.core.flight_core import FlightCore
 from companion.mission.air import Expectation
 from companion.model.flight_stage import Stage
+from companion.model.markers import BallState
 from companion.model.outputs import ChaseState, TetherState
 from companion.model.team import Grip
 from companion.model.types import OperatorCommand, PhaseKind, SafetyAction, Vec3
@@ -101,12 +102,19 @@ def test_rules_that_forbid_to_resume_are_looked_up_for_a_resume_and_in_a_hold_wi
 
 
 @pytest.mark.parametrize(
-    ("chase", "acceleration_m_s2", "chases"), [(CHASE, 1.1, True), (CHASE, 0.9, False), (None, 1.1, False)]
+    ("expected", "acceleration_m_s2", "chases"),
+    [
+        (Expectation(chase=CHASE), 1.1, True),
+        (Expectation(chase=CHASE), 0.9, False),
+        (Expectation(ball=BallState(position_world_m=(1.0, 0.0, 1.0))), 1.1, True),
+        (Expectation(), 1.1, False),
+    ],
+    ids=["chase", "chase-at-rest", "aside-for-a-ball", "neither"],
 )
-def test_a_chase_is_one_while_its_reference_accelerates(
-    chase: ChaseState | None, acceleration_m_s2: float, chases: bool
+def test_a_chase_and_a_move_aside_swing_the_vehicle_while_the_reference_accelerates(
+    expected: Expectation, acceleration_m_s2: float, chases: bool
 ) -> None:
-    core = core_in_flight(expected=Expectation(chase=chase))
+    core = core_in_flight(expected=expected)
     core._reference = replace(at_rest((0.0, 0.0, 1.0), 0.0, ()), acceleration_world_m_s2=(0.0, acceleration_m_s2, 0.0))
     core._observe(healthy(), 0.005)
     assert core._context.chases is chases
