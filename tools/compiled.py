@@ -48,6 +48,7 @@ COMPILED = (
     "companion/phases/contact/surface.py",
     "companion/phases/contact/way.py",
     "companion/phases/intercept/ball.py",
+    "companion/phases/intercept/lag.py",
     "companion/phases/intercept/meeting.py",
     "companion/phases/intercept/motion.py",
     "companion/phases/intercept/net.py",

@@ -26,7 +26,8 @@ from companion.model.markers import Marker, MarkerFrame
 from companion.model.types import Inputs, OperatorCommand, Reference, Vec3, VehicleState
 from companion.phases.intercept import ball, choice, phase
 from companion.phases.intercept.ball import Candidate
-from companion.phases.intercept.meeting import APART_S, BODY_S2, RISES_S, TILT_S2_M, TRIED_MAX, Lag, meetings, reach_of
+from companion.phases.intercept.lag import BODY_S2, TILT_S2_M, Lag
+from companion.phases.intercept.meeting import APART_S, RISES_S, TRIED_MAX, meetings, reach_of
 from companion.phases.intercept.motion import OVERSHOOT, Bounds, State
 from companion.phases.intercept.net import net_m, opening
 from companion.phases.intercept.phase import Intercept
@@ -241,6 +242,37 @@ def test_the_way_to_none_of_200_balls_and_the_stop_after_it_leave_a_limit() -> N
         assert math.hypot(*stop.at(stop.end_s).velocity_m_s) < 1e-9, "at rest after the stop"
     assert found > 50, "too few balls are met to judge"
     assert held < found / 4, "most ways end at a limit"
+
+
+def test_the_reference_is_pushed_as_wanted_until_it_must_brake() -> None:
+    now, wanted = State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), (0.0, 6.2, 0.0)
+    for tick in range(20):
+        pushed = BOUNDS.pushed(tick * TICK_PERIOD_S, now, TICK_PERIOD_S, wanted)
+        assert pushed is not None
+        now = pushed
+        assert tick < 10 or math.dist(now.acceleration_m_s2, wanted) < 0.05, f"eased after {tick} ticks"
+
+
+@pytest.mark.parametrize("wanted", [(6.0, 0.0, 0.0), (0.0, 6.0, 0.0), (3.0, -5.0, 1.0), (-4.0, -4.0, -2.0)], ids=str)
+def test_the_body_that_lags_behind_a_push_could_always_stop_in_the_room(wanted: Vec3) -> None:
+    now, lag, stop = (
+        State(HOME.position_world_m, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        Lag(),
+        StopModel(CONFIG.vehicle.safety),
+    )
+    nearest_m = math.inf
+    for tick in range(300):
+        t_s = tick * TICK_PERIOD_S
+        pushed = BOUNDS.pushed(t_s, now, TICK_PERIOD_S, wanted, lag)
+        now = BOUNDS.stop(t_s, now).at(t_s + TICK_PERIOD_S) if pushed is None else pushed
+        lag = lag.after(TICK_PERIOD_S, now.acceleration_m_s2)
+        velocity = np.add(now.velocity_m_s, (*lag.body_m_s(now.acceleration_m_s2), 0.0))
+        at_m = np.add(now.position_m, (*lag.body_m(), 0.0)) + velocity * stop.time_s(float(np.linalg.norm(velocity)))
+        place = (float(at_m[0]), float(at_m[1]), float(at_m[2]))
+        out_m = max(SAFE.breach_walls_m(place), SAFE.breach_tether_m(place))
+        assert out_m < CONFIG.vehicle.safety.geofence_tolerance_m, f"after {t_s:.2f} s"
+        nearest_m = min(nearest_m, -out_m)
+    assert nearest_m < 0.1, "it never comes near a limit"
 
 
 class Tick(Air):
@@ -491,6 +523,38 @@ def test_a_chase_in_which_the_ball_comes_to_the_rotors_stops_unless_the_stop_or_
     monkeypatch.setattr(choice, "room_m", lambda *_: 0.0)
     flown = Flown(frames([MEETABLE], 0.6), 0.5)
     assert "ball_at_rotors" in flown.ids and (flown.states[-1].mode is Mode.STOP) == stops
+
+
+@pytest.mark.parametrize(("room_m", "goes_on"), [(0.045, True), (0.035, False)])
+def test_a_ball_that_is_chased_may_come_a_centimetre_nearer_to_the_rotors_than_one_that_is_not(
+    room_m: float, goes_on: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def room_of_plan_m(air: Air, s: Interception, *_: Any) -> float:
+        return 0.06 if s.mode is Mode.WAIT else room_m
+
+    monkeypatch.setattr(phase, "room_of_plan_m", room_of_plan_m)
+    monkeypatch.setattr(choice, "room_of_plan_m", room_of_plan_m)
+    flown = Flown(frames([MEETABLE], 0.6), 0.5)
+    assert ("ball_at_rotors" not in flown.ids) is goes_on
+
+
+def test_a_chase_that_comes_to_a_limit_follows_the_stop_and_goes_on_when_it_can(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = Bounds.pushed
+
+    def pushed(bounds: Bounds, t_s: float, *arguments: Any) -> State | None:
+        return None if 0.3 <= t_s < 0.32 else asked(bounds, t_s, *arguments)
+
+    monkeypatch.setattr(Bounds, "pushed", pushed)
+    flown = Flown(frames([MEETABLE], 0.6), 12.0)
+    assert flown.ids == ["ball_seen", "meeting_planned"] and flown.over
+    chased = [k for k, state in enumerate(flown.states, 1) if state.mode is Mode.CHASE]
+    assert max(chased) * TICK_PERIOD_S > 0.5
+    for before, after in itertools.pairwise(flown.references):
+        moved = np.subtract(after.position_world_m, before.position_world_m)
+        velocity = np.add(before.velocity_world_m_s, after.velocity_world_m_s) / 2
+        assert moved == pytest.approx(TICK_PERIOD_S * velocity, abs=5e-5)
 
 
 def test_frames_lost_for_50_ms_do_not_end_a_chase() -> None:

@@ -21,6 +21,8 @@ from companion.safety.notices import EventDefinition
 
 BALL_M: Final = 0.05
 """Distance of its centre from the rotor disks at which a ball passes them; it may be this large."""
+CHASED_M: Final = 0.04
+"""The same for a ball that is chased: what a newer frame shows differs by about a centimetre, and a ball is 35 mm in radius."""
 DODGE_STEP_S, DODGE_STEPS = 0.06, 6
 """Steps in which it is looked what the limits leave of a dodge."""
 JUDGED_S: Final = 0.04
@@ -43,7 +45,7 @@ def chosen(air: Air, s: Interception, bounds: Bounds, path: list[Point]) -> Inte
         kept_m = room_of_plan_m(air, s, bounds, path, s.plan)
     else:
         kept_m = room_m(air, s, path, push_of(air, s))
-    if kept_m >= BALL_M or not path or air.t_s - s.judged_s < JUDGED_S:
+    if kept_m >= enough_m(s) or not path or air.t_s - s.judged_s < JUDGED_S:
         return s
     s = replace(s, judged_s=air.t_s)
     stop_m = room_of_stop_m(air, s, bounds, path)
@@ -64,6 +66,11 @@ def chosen(air: Air, s: Interception, bounds: Bounds, path: list[Point]) -> Inte
         nearest = min(path, key=lambda point: math.dist(point.position_m, body_m))
         return replace(s, mode=Mode.DODGE, motion=None, dodge=Dodge(push, nearest.t_s))
     return replace(s, mode=Mode.STOP) if stop_m > kept_m and s.mode in PUSHED else s
+
+
+def enough_m(s: Interception) -> float:
+    """Return the distance from the rotors that a ball must keep."""
+    return CHASED_M if s.mode is Mode.CHASE else BALL_M
 
 
 def push_of(air: Air, s: Interception) -> Callable[[float], Vec3]:

@@ -11,20 +11,15 @@ import functools
 import itertools
 import math
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Final
 
 from companion.model.codec import Record
 from companion.model.types import Vec3
 from companion.phases.intercept.ball import Point
+from companion.phases.intercept.lag import BODY_S2, TILT_S2_M, Lag, faded, fading, impulse_1_s
 from companion.phases.intercept.motion import Bounds, State
 
-LAG_S: Final = 0.12
-"""Time constant of each of the lags through which body and tilt follow the reference's acceleration."""
-BODY_S2 = (0.0, -0.051, 0.182, -0.421, 0.274)
-"""Displacement of the body from its reference per acceleration after one to five lags, horizontally."""
-TILT_S2_M = (0.0, 0.050, 0.174, 0.186, -0.337)
-"""Slope of the body's tilt, the same. These were identified in the fast loop, in other laboratories than those of the figures."""
 SWINGS: Final = 0.85
 """Share of the net's distance below the body's origin by which it swings against the tilt: the arm gives way."""
 RISES_S: Final = 0.02
@@ -46,62 +41,6 @@ STEP_S: Final = 0.02
 TRIED_MAX: Final = 3
 APART_S: Final = 0.05
 """Number of meetings that are tried, those of the least effort first, until the ball clears the rotors, and the time between two."""
-
-
-class Lag(Record, frozen=True):
-    """The reference's horizontal acceleration after one to five lags of `LAG_S`: how body and tilt follow it."""
-
-    x_m_s2: tuple[float, ...] = (0.0,) * len(BODY_S2)
-    y_m_s2: tuple[float, ...] = (0.0,) * len(BODY_S2)
-
-    def after(self, dt_s: float, acceleration_m_s2: Vec3) -> Lag:
-        """Return the lags after a tick with this acceleration."""
-        x, y, _ = acceleration_m_s2
-        return Lag(_lagging(self.x_m_s2, x, dt_s), _lagging(self.y_m_s2, y, dt_s))
-
-    def net_m(self, drop_m: float, ahead_m: tuple[float, float]) -> Vec3:
-        """Return the displacement of the net from where it hangs at the reference.
-
-        Args:
-            drop_m: distance of the net below the body's origin by which it swings.
-            ahead_m: horizontal position of the net relative to the body, world frame.
-        """
-        (x, y), (u, v) = self.slopes(), self.body_m()
-        return (u - drop_m * x, v - drop_m * y, -ahead_m[0] * x - ahead_m[1] * y)
-
-    def body_m(self) -> tuple[float, float]:
-        """Return the horizontal displacement of the body from its reference, world frame."""
-        return sum(map(operator.mul, BODY_S2, self.x_m_s2)), sum(map(operator.mul, BODY_S2, self.y_m_s2))
-
-    def slopes(self) -> tuple[float, float]:
-        """Return the slopes of the body's tilt, world frame."""
-        return sum(map(operator.mul, TILT_S2_M, self.x_m_s2)), sum(map(operator.mul, TILT_S2_M, self.y_m_s2))
-
-
-def _lagging(values: tuple[float, ...], followed: float, dt_s: float) -> tuple[float, ...]:
-    found = []
-    for value in values:
-        followed = value + dt_s / LAG_S * (followed - value)
-        found.append(followed)
-    return tuple(found)
-
-
-def _fading(values: Sequence[float], weights: Sequence[float]) -> list[float]:
-    """Return the coefficients with which `_faded` gives the weighted sum of the lags a time later, if the acceleration ends."""
-    count = len(values)
-    return [sum([weights[n] * values[n - k] for n in range(k, count)]) / math.factorial(k) for k in range(count)]
-
-
-def _faded(coefficients: Sequence[float], h: float) -> float:
-    total, u = 0.0, h / LAG_S
-    for coefficient in reversed(coefficients):
-        total = total * u + coefficient
-    return total * math.exp(-u)
-
-
-def _impulse_1_s(weights: tuple[float, ...], left_s: float) -> float:
-    """Return the weighted sum of the lags' responses to an impulse of acceleration, a time after it."""
-    return _faded([weight / math.factorial(n) for n, weight in enumerate(weights)], left_s) / LAG_S
 
 
 class Plan(Record, frozen=True):
@@ -133,7 +72,7 @@ def aside_s(left_s: float, drop_m: float) -> float:
         left_s: time since the change.
         drop_m: distance of the net below the body's origin, by which it swings against the tilt.
     """
-    return left_s + _impulse_1_s(BODY_S2, left_s) - drop_m * _impulse_1_s(TILT_S2_M, left_s)
+    return left_s + impulse_1_s(BODY_S2, left_s) - drop_m * impulse_1_s(TILT_S2_M, left_s)
 
 
 class Reach:
@@ -149,7 +88,7 @@ class Reach:
         """Distance by which it swings."""
         times = [(k + 0.5) * STEP_S for k in range(math.ceil(horizon_s / STEP_S))]
         self._aside, self._up = [aside_s(t, drop_m) for t in times], [t - RISES_S for t in times]
-        self._tilt = [_impulse_1_s(TILT_S2_M, t) for t in times]
+        self._tilt = [impulse_1_s(TILT_S2_M, t) for t in times]
         self._asides_s2, self._ups_s2 = (
             list(itertools.accumulate(STEP_S * abs(response) for response in responses))
             for responses in (self._aside, self._up)
@@ -229,9 +168,9 @@ def meetings(
     most = bounds.acceleration_m_s2
     (x, y, z), (vx, vy, vz), (nx, ny, nz), (ox, oy, oz) = now.position_m, now.velocity_m_s, net_m, opening
     swings = [body - reach.drop_m * tilt for body, tilt in zip(BODY_S2, TILT_S2_M, strict=True)]
-    left_x, left_y = _fading(lag.x_m_s2, swings), _fading(lag.y_m_s2, swings)
+    left_x, left_y = fading(lag.x_m_s2, swings), fading(lag.y_m_s2, swings)
     left_z = [
-        nx * a + ny * b for a, b in zip(_fading(lag.x_m_s2, TILT_S2_M), _fading(lag.y_m_s2, TILT_S2_M), strict=True)
+        nx * a + ny * b for a, b in zip(fading(lag.x_m_s2, TILT_S2_M), fading(lag.y_m_s2, TILT_S2_M), strict=True)
     ]
     for point in path:
         h, (bx, by, bz), (ux, uy, uz) = point.t_s - t_s, point.position_m, point.velocity_m_s
@@ -239,9 +178,9 @@ def meetings(
         early = h >= (LEAST_S if kept_s is None else FROZEN_S)
         if not early or facing < FACING or not bounds.in_box((bx - nx, by - ny, bz - nz)):
             continue
-        dx = bx - nx - x - h * vx - _faded(left_x, h)
-        dy = by - ny - y - h * vy - _faded(left_y, h)
-        dz = bz - nz - z - (h - RISES_S) * vz + _faded(left_z, h)
+        dx = bx - nx - x - h * vx - faded(left_x, h)
+        dy = by - ny - y - h * vy - faded(left_y, h)
+        dz = bz - nz - z - (h - RISES_S) * vz + faded(left_z, h)
         _, aside_s2, up_s2 = reach.of(h)
         needed = math.hypot(dx / aside_s2, dy / aside_s2, dz / up_s2) / most
         needed = max(needed, math.hypot(dx, dy, dz) / (bounds.speed_m_s * h))

@@ -21,23 +21,24 @@ from companion.model.algebra import scaled
 from companion.model.codec import Record
 from companion.model.constants import GRAVITY_M_S2
 from companion.model.types import Vec3
+from companion.phases.intercept.lag import Lag
 from companion.safety.governor import SafeSet
 from companion.safety.stop import StopModel
 
 SHARE: Final = 0.98
 """Fraction of the limits of speed, acceleration and jerk that is used: the governor compares differences between ticks with them."""
-TILT_RESERVE_RAD: Final = math.radians(2.0)
-"""Tilt that is left to the control law."""
+TILT_RESERVE_RAD: Final = math.radians(5.0)
+"""Tilt that is left to the control law, which pulls the lagging body after the reference."""
 STOP_LEAST_S: Final = 0.5
 """Shortest duration of a stop."""
 PIECES: Final = 3
 """Number of pieces of a motion that are compared with the limits: the coefficients of a short piece are close to the curve."""
 OVERSHOOT: Final = 1.4
-"""Speed of the body, as a multiple of the reference's, for which there is room to stop: it comes later, and then faster."""
-EASED = (1.0, 0.5, 0.0)
-"""Fractions of the wanted acceleration that are tried one after the other."""
+"""Speed of the body, as a multiple of the reference's, for which there is room to stop if its lags are not known."""
+LOOK_S, LOOKS = 0.04, 9
+"""Times after the start of a stop at which there must be room for the lagging body to stop: it goes on after the reference."""
 BRAKE_M_S2: Final = 2.0
-"""Deceleration that is tried after them."""
+"""Deceleration that is tried after the wanted acceleration, half of it, and what is vertical of it."""
 
 
 class State(Record, frozen=True):
@@ -139,16 +140,33 @@ class Bounds:
         (x, y, z), (hx, hy, hz), (bx, by, bz) = p, self._home_m, self._box_m
         return abs(x - hx) <= bx and abs(y - hy) <= by and abs(z - hz) <= bz
 
-    def admit(self, m: Motion) -> bool:
-        """Return whether a motion respects every limit at all times, and leaves room to stop at all times."""
+    def admit(self, m: Motion, lag: Lag | None = None) -> bool:
+        """Return whether a motion respects every limit at all times, and leaves room to stop at all times.
+
+        Args:
+            m: the motion.
+            lag: lagging acceleration at its start; None to allow for `OVERSHOOT` instead.
+        """
         h = m.duration_s / PIECES
         for k in range(PIECES):
             begin, b, c = m.at(m.start_s + k * h), _plus(m.beta, m.alpha, k * h), m.alpha
-            if not self._admits_piece(Motion(m.start_s, h, begin, c, b, begin.jerk_m_s3)):
+            piece = Motion(m.start_s, h, begin, c, b, begin.jerk_m_s3)
+            if not self._admits_piece(piece, OVERSHOOT if lag is None else 1.0):
+                return False
+        return lag is None or self._can_stop(m, lag)
+
+    def _can_stop(self, m: Motion, lag: Lag) -> bool:
+        """Return whether the body that lags behind a motion could stop within the safe set at all times."""
+        for k in range(LOOKS):
+            s = m.at(m.start_s + k * LOOK_S)
+            lag = lag.after(LOOK_S, s.acceleration_m_s2) if k else lag
+            (x, y), (vx, vy) = lag.body_m(), lag.body_m_s(s.acceleration_m_s2)
+            v = _plus(s.velocity_m_s, (vx, vy, 0.0), 1.0)
+            if not self._safe.holds(_plus(_plus(s.position_m, (x, y, 0.0), 1.0), v, self._stop.time_s(math.hypot(*v)))):
                 return False
         return True
 
-    def _admits_piece(self, m: Motion) -> bool:
+    def _admits_piece(self, m: Motion, overshoot: float) -> bool:
         """Return whether the Bernstein coefficients of a motion respect every limit."""
         h = m.duration_s
         jerks = [m.gamma, _plus(m.gamma, m.beta, 0.5 * h), _plus(_plus(m.gamma, m.beta, h), m.alpha, 0.5 * h * h)]
@@ -162,7 +180,7 @@ class Bounds:
         places = _integrated(m.begin.position_m, speeds, h / 5.0)
         # The velocity in the coefficients of degree 5.
         raised = [_plus(scaled(speeds[max(0, k - 1)], 0.2 * k), speeds[min(4, k)], 1.0 - 0.2 * k) for k in range(6)]
-        stop_s, safe = OVERSHOOT * self._stop.time_s(OVERSHOOT * fastest), self._safe
+        stop_s, safe = overshoot * self._stop.time_s(overshoot * fastest), self._safe
         return all(
             self.in_box(p) and safe.holds(p) and safe.holds(_plus(p, v, stop_s))
             for p, v in zip(places, raised, strict=True)
@@ -173,15 +191,17 @@ class Bounds:
         up = a[2] + GRAVITY_M_S2
         return math.hypot(a[0], a[1]) <= self._slope * up and math.hypot(a[0], a[1], up) <= self._thrust_m_s2
 
-    def pushed(self, t_s: float, now: State, dt_s: float, push_m_s2: Vec3) -> State | None:
+    def pushed(self, t_s: float, now: State, dt_s: float, push_m_s2: Vec3, lag: Lag | None = None) -> State | None:
         """Return the state a tick later with an acceleration as near to the wanted one as the limits allow; None if only the stop from
         this state respects them.
         """
-        speed_m_s = math.hypot(*now.velocity_m_s) or 1.0
-        tried = [scaled(push_m_s2, share) for share in EASED] + [scaled(now.velocity_m_s, -BRAKE_M_S2 / speed_m_s)]
+        (x, y, z), (vx, vy, vz) = push_m_s2, now.velocity_m_s
+        share = -BRAKE_M_S2 / (math.hypot(vx, vy, vz) or 1.0)
+        brake = (share * vx, share * vy, share * vz)
+        tried = [push_m_s2, (0.5 * x, 0.5 * y, 0.5 * z), (0.0, 0.0, z), (brake[0], brake[1], z), brake]
         for push in tried:
             after = self._after(now, dt_s, self.within(push))
-            if self.admit(self.stop(t_s, after)):
+            if self.admit(self.stop(t_s, after), lag):
                 return after
         return None
 
@@ -215,9 +235,8 @@ class Bounds:
         )
 
     def stop(self, t_s: float, begin: State) -> Motion:
-        """Return a stop whose acceleration is half of what the mission allows, or less."""
-        needed = max(math.hypot(*begin.velocity_m_s) * 1.5, math.hypot(*begin.acceleration_m_s2) * STOP_LEAST_S)
-        duration_s = max(STOP_LEAST_S, needed / (0.5 * self.acceleration_m_s2))
+        """Return a stop that needs half of the acceleration that the mission allows if the reference does not accelerate, or less."""
+        duration_s = max(STOP_LEAST_S, 3.0 * math.hypot(*begin.velocity_m_s) / self.acceleration_m_s2)
         return motion_to(t_s, begin, duration_s, None)
 
 

@@ -20,7 +20,7 @@ from companion.model.outputs import ChaseState
 from companion.model.types import Reference, SafetyAction, Severity, Vec3
 from companion.phases.intercept import ball
 from companion.phases.intercept.ball import Candidate, Point
-from companion.phases.intercept.choice import BALL_M, chosen, now_s, push_of, reach, room_of_plan_m
+from companion.phases.intercept.choice import chosen, enough_m, now_s, push_of, reach, room_of_plan_m
 from companion.phases.intercept.meeting import FROZEN_S, RISES_S, Plan, meetings
 from companion.phases.intercept.motion import Bounds, State, motion_to
 from companion.phases.intercept.net import beside_m, net_m, opening
@@ -276,9 +276,9 @@ class Intercept(Phase):
         if s.mode not in PUSHED:
             return s
         bounds = self._bounds(air, s)
-        now = bounds.pushed(air.t_s, s.now, air.dt_s, push_of(air, s)(air.t_s))
+        now = bounds.pushed(air.t_s, s.now, air.dt_s, push_of(air, s)(air.t_s), s.lag)
         if now is None:
-            return replace(s, mode=Mode.STOP)
+            now = bounds.stop(air.t_s - air.dt_s, s.now).at(air.t_s)
         return replace(s, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
 
     def _path(self, air: Air, s: Interception, candidate: Candidate) -> list[Point]:
@@ -316,7 +316,7 @@ class Intercept(Phase):
             reach(air, s),
             kept_s,
         )
-        return next((plan for plan in plans if room_of_plan_m(air, s, bounds, path, plan) >= BALL_M), None)
+        return next((plan for plan in plans if room_of_plan_m(air, s, bounds, path, plan) >= enough_m(s)), None)
 
 
 def _planned(s: Interception, plan: Plan, left_s: float) -> Interception:

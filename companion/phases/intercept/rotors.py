@@ -15,7 +15,7 @@ from companion.model.constants import GRAVITY_M_S2
 from companion.model.frames import quat_from_euler_zyx, quat_rotate, yaw_from_quat
 from companion.model.types import Vec3, VehicleState
 from companion.phases.intercept.ball import Point
-from companion.phases.intercept.meeting import Lag
+from companion.phases.intercept.lag import Lag
 from companion.phases.intercept.motion import State
 
 FAR_M: Final = 0.3

@@ -9,7 +9,8 @@ from companion.model.codec import Record
 from companion.model.outputs import ChaseState
 from companion.model.types import Reference, Vec3
 from companion.phases.intercept.ball import Candidate
-from companion.phases.intercept.meeting import Lag, Plan
+from companion.phases.intercept.lag import Lag
+from companion.phases.intercept.meeting import Plan
 from companion.phases.intercept.motion import Motion, State
 
 
