@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -36,5 +37,6 @@ def run(arguments: argparse.Namespace) -> int:
     except OSError as error:
         raise ConfigError(f"companion init: {folder}: cannot be written: {error}") from None
     print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-    print(f"try: companion fly {folder / 'missions' / DEFAULT_MISSION}.yaml --sitl")
+    line = shlex.join(["companion", "fly", f"{folder / 'missions' / DEFAULT_MISSION}.yaml", "--sitl"])
+    print(f"try: {line}")
     return EXIT_OK
