@@ -217,7 +217,7 @@ BROKEN = "(float('nan'), *wrench.log.error[1:])"
 def test_one_that_fails_in_the_air_ends_the_flight_as_every_exception_of_the_core_does(
     tmp_path: Path, broken: str, lost: str
 ) -> None:
-    """A campaign reports the flight as lost. Over the wires the guardian lands: tests/flights/test_guardian.py."""
+    """A campaign reports the flight as lost. Over the wires the guardian lands: tests/launcher/test_team.py."""
     code = f"if 0.5 < state.position_world_m[2] < 0.9:\n            {broken}\n        return wrench\n"
     write_law(tmp_path, REPLACE + LAW + STEP + code)
     with on_path(tmp_path):
