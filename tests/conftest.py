@@ -83,6 +83,14 @@ def short_wait() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def short_start(short_wait: None) -> Iterator[None]:
+    """The wait of a flight before its take-off is short, and so is the stream of setpoints before OFFBOARD: a second less."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("companion.model.flight_stage.STREAM_BEFORE_OFFBOARD_S", 0.1)
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _nothing_is_hoarded(request: pytest.FixtureRequest) -> Iterator[None]:
     """What a file's tests share by `@cache`, whole flights mostly, goes with its last test: it would weigh on every test after them."""

@@ -30,7 +30,7 @@ from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from tests.flights.ends import after, contact_over, flown_until
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 PRESS = "configs/missions/press.yaml"
 SHORT = (

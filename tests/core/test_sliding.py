@@ -20,7 +20,7 @@ from companion.mission.check import check_mission
 from companion.model.contact import ContactMode
 from companion.model.frames import euler_zyx_from_quat
 from companion.model.outputs import Outputs
-from companion.model.types import Joints, Outcome, Vec3
+from companion.model.types import Joints, Vec3
 from companion.phases.contact.force import touches
 from companion.phases.contact.sliding import STEER_MAX_RAD, UNSEEN_MAX_N
 from companion.sitl_config.loader import load_sitl
@@ -30,7 +30,7 @@ from sitl.fast.result import FastResult
 from tests.control.states import ZERO, at, at_rest
 from tests.flights.ends import after, contact_over, flown_until
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 SLIDE = "configs/missions/slide.yaml"
 ARM: Joints = (1.1, 1.4)
@@ -53,8 +53,8 @@ def short_slide(friction: float) -> list[str]:
         "mission.start.position_m=[0.4,0.0]",
         "mission.phases[0]={type: takeoff, height_m: 0.8, duration_s: 2.0}",
         "mission.phases[1].duration_s=0.1",
-        "mission.phases[2].to_m=[0.66,0.0,0.8]",
-        "mission.phases[3]={type: approach, direction: [1.0, 0.0, 0.0], distance_max_m: 0.3, speed_m_s: 0.05}",
+        "mission.phases[2].to_m=[0.72,0.0,0.8]",
+        "mission.phases[3]={type: approach, direction: [1.0, 0.0, 0.0], distance_max_m: 0.25, speed_m_s: 0.05}",
         "mission.phases[4]={type: slide, force_n: 3.0, displacement_m: [0.0, -0.2], speed_m_s: 0.08}",
         "mission.phases[6].to_m=[0.5,0.0,0.8]",
     ]
@@ -68,13 +68,13 @@ def slide(friction: float, *more: str, until: Callable[[Outputs], bool] | None =
 
 @pytest.fixture(scope="module")
 def slid() -> tuple[FastFlight, FastResult]:
-    return slide(0.5)
+    return slide(0.5, until=lambda o: o.phase == "detach")
 
 
 def test_the_tip_follows_its_path_while_the_force_is_held(slid: tuple[FastFlight, FastResult]) -> None:
     flight, result = slid
-    assert result.outputs[-1].outcome is Outcome.COMPLETED and not result.crashed and result.layout is not None
-    assert {e.id for o in result.outputs for e in o.events} == {"takeoff", "touched", "touchdown"}
+    assert not result.crashed and result.layout is not None
+    assert [e.id for o in result.outputs for e in o.events] == ["takeoff", "touched"]
     sliding = np.array([o.contact is not None and o.contact.mode is ContactMode.SLIDE for o in result.outputs])
     tips, forces = zip(*(result.layout.contact(s.sensors) for s in result.snapshots), strict=True)
     tip, force_n = np.array(tips)[sliding], -np.array(forces)[sliding, 0]
@@ -135,7 +135,7 @@ def test_a_reading_across_the_tool_that_no_friction_explains_is_no_tether(slid: 
 
 
 def test_a_tether_that_jams_in_a_slide_is_noticed_before_the_tip_has_lost_the_wall() -> None:
-    jams = "world.faults=[{kind: tether_taut, t_s: 11.2, size: 0.0}]"
+    jams = "world.faults=[{kind: tether_taut, t_s: 10.0, size: 0.0}]"
     above = "vehicle.tether.anchor_world_m=[0.4,0.0,1.65]"  # on the way down the distance grows
     flight = FastFlight(
         load_sitl(

@@ -20,7 +20,7 @@ from tests.flights.ends import after
 from tests.flights.test_fast_flights import event_ids
 from tests.support import SHORT_CATCH
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 CONFIRMED_S = 1.0
 """After the catch."""

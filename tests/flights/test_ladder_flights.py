@@ -26,8 +26,10 @@ from companion.model.types import (
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
-from tests.flights.ends import after
+from tests.flights.ends import Changed, after, flown_until
 from tests.support import HOVER, LOW_HOVER, SHORT_CATCH, tether_of
+
+pytestmark = pytest.mark.usefixtures("short_start")
 
 replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
@@ -37,23 +39,12 @@ def configured(*overrides: str) -> SitlConfig:
     return load_sitl("configs/missions/catch.yaml", preset="recommended", overrides=overrides)
 
 
-class Changed(FastFlight):
-    """A flight whose companion sees other inputs than there are."""
-
-    def __init__(self, config: SitlConfig, change: Change) -> None:
-        super().__init__(config)
-        self._change = change
-
-    def _inputs(self, tick: int) -> Inputs:
-        return self._change(super()._inputs(tick))
-
-
 def flown(change: Change, *overrides: str, limit_s: float = 90.0) -> FastResult:
     return Changed(configured(*overrides), change).run(limit_s)
 
 
 def short(*overrides: str) -> SitlConfig:
-    """Take-off at 5.2 s, on the line from 6.7 s, the catch at 7.7 s, landing from 9.7 s on."""
+    """Take-off at 3.2 s, on the line from 4.7 s, the catch at 5.7 s, landing from 7.7 s on."""
     return load_sitl(SHORT_CATCH, preset="recommended", overrides=overrides)
 
 
@@ -94,29 +85,29 @@ def assert_safe(result: FastResult) -> None:
 
 
 def test_held_it_stays_and_going_on_it_completes() -> None:
-    result = short_flown(asking((7.2, OperatorCommand.HOLD), (9.2, OperatorCommand.RESUME)), *HIGHER)
+    result = short_flown(asking((5.2, OperatorCommand.HOLD), (6.8, OperatorCommand.RESUME)), *HIGHER)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
     assert event_ids(result) == ["takeoff", "operator_hold", "operator_resume", "catch", "touchdown"]
-    held = [truth.position_world_m for truth in result.truth if 8.4 < truth.t_s < 9.2]
+    held = [truth.position_world_m for truth in result.truth if 6.2 < truth.t_s < 6.8]
     assert max(math.dist(held[0], p) for p in held) < 0.05
-    assert at(result, 9.0).action is SafetyAction.HOLD
-    assert at(result, 9.7).action is SafetyAction.NOMINAL
+    assert at(result, 6.7).action is SafetyAction.HOLD
+    assert at(result, 7.3).action is SafetyAction.NOMINAL
     assert_safe(result)
 
 
 def test_held_too_long_it_lands() -> None:
-    result = short_flown(asking((8.0, OperatorCommand.HOLD)), *HIGHER, "vehicle.safety.hold_max_s=1")
-    assert result.outputs[-1].outcome is Outcome.ABORTED
-    assert event_ids(result) == ["takeoff", "operator_hold", "hold_expired", "touchdown"]
-    assert_safe(result)
+    flight = Changed(short(*HIGHER, "vehicle.safety.hold_max_s=0.5"), asking((6.0, OperatorCommand.HOLD)))
+    result = flight.run(until=after("hold_expired", 1.0))
+    assert event_ids(result) == ["takeoff", "operator_hold", "hold_expired"]
+    assert result.outputs[-1].action is SafetyAction.LAND and not result.crashed
 
 
 def test_aborted_it_lands_at_once_with_the_arm_folded() -> None:
-    script = (8.0, OperatorCommand.HOLD), (9.0, OperatorCommand.ABORT), (9.5, OperatorCommand.RESUME)
+    script = (6.0, OperatorCommand.HOLD), (6.5, OperatorCommand.ABORT), (7.0, OperatorCommand.RESUME)
     result = short_flown(asking(*script), *HIGHER)
     last = result.outputs[-1]
     assert (last.outcome, last.action) == (Outcome.ABORTED, SafetyAction.LAND)
-    assert last.t_s < 15.0
+    assert last.t_s < 12.5
     folded = [math.degrees(angle) for angle in result.truth[-1].joint_angle_rad]
     assert max(abs(a - b) for a, b in zip(folded, (165.0, 140.0), strict=True)) < 12
     assert_safe(result)
@@ -162,16 +153,16 @@ def test_a_way_back_that_takes_too_long_becomes_a_landing() -> None:
 @pytest.mark.parametrize(
     ("command", "overrides", "stolen_s"),
     [
-        (OperatorCommand.HOLD, HIGHER, 10.0),
-        (OperatorCommand.NONE, TAUT, 7.0),
-        (OperatorCommand.LAND, HIGHER, 8.5),
+        (OperatorCommand.HOLD, HIGHER, 6.4),
+        (OperatorCommand.NONE, TAUT, 5.0),
+        (OperatorCommand.LAND, HIGHER, 6.4),
     ],
     ids=["in a hold", "in a retract", "in a landing"],
 )
 def test_a_pilot_who_takes_over_is_left_alone(
     command: OperatorCommand, overrides: tuple[str, ...], stolen_s: float
 ) -> None:
-    asked = asking((8.0, command))
+    asked = asking((6.0, command))
 
     def change(i: Inputs) -> Inputs:
         i = asked(i)
@@ -180,7 +171,7 @@ def test_a_pilot_who_takes_over_is_left_alone(
         return i
 
     fly = flown if overrides is TAUT else short_flown
-    result = fly(change, *overrides, limit_s=stolen_s + 1.0)
+    result = fly(change, *overrides, limit_s=stolen_s + 0.6)
     assert "pilot_took_over" in event_ids(result)
     after = [o for o in result.outputs if o.t_s >= stolen_s]
     assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
@@ -191,12 +182,14 @@ def test_a_pilot_who_takes_over_from_px4s_landing_is_left_alone() -> None:
     """Motion capture is lost, PX4 lands, somebody takes the sticks: no request goes against them."""
 
     def change(i: Inputs) -> Inputs:
-        if i.status is not None and i.t_s >= 9.5:
+        if i.status is not None and i.t_s >= 6.0:
             i = replace(i, status=replace(i.status, mode=FlightMode.MANUAL))
         return i
 
-    result = flown(change, "world.faults=[{kind: mocap_loss, t_s: 6.0}]", limit_s=10.5)
-    after = [o for o in result.outputs if o.t_s >= 9.5]
+    config = short("world.faults=[{kind: mocap_loss, t_s: 3.0}]")
+    result = flown_until(Changed(config, change), lambda o: o.t_s >= 6.6)
+    after = [o for o in result.outputs if o.t_s >= 6.0]
+    assert result.outputs[after[0].tick - 1].action is SafetyAction.AUTOPILOT_LAND
     assert any(event.text == "a pilot took over" for o in after for event in o.events)
     assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
 
@@ -204,9 +197,9 @@ def test_a_pilot_who_takes_over_from_px4s_landing_is_left_alone() -> None:
 def test_a_pilot_who_takes_over_after_touch_down_is_not_disarmed() -> None:
     """PX4's land detector takes its time, and in the middle of that the pilot switches to Hold: FORCE_DISARM left all the same."""
     slow = "world.px4_params={LNDMC_TRIG_TIME: 5.0}"
-    taken = "world.faults=[{kind: pilot_takeover, t_s: 8.5, size: 3.0}]"
+    taken = "world.faults=[{kind: pilot_takeover, t_s: 8.0, size: 3.0}]"
     low = [f"{key}={value}" for key, value in LOW_HOVER.items()]
-    result = FastFlight(load_sitl(HOVER, overrides=[*low, slow, taken])).run(limit_s=14.0)
+    result = flown_until(FastFlight(load_sitl(HOVER, overrides=[*low, slow, taken])), lambda o: o.t_s >= 11.5)
     assert event_ids(result) == ["takeoff", "touchdown", "pilot_took_over"]
     last = result.inputs[-1].status
     assert last is not None and last.armed, "PX4 disarms when the pilot has landed"
@@ -247,7 +240,7 @@ def test_broken_values_for_a_moment_never_reach_the_law_and_the_mission_goes_on(
 
     def change(i: Inputs) -> Inputs:
         part, tick = divmod(i.tick % 100, 20)
-        return list(BROKEN.values())[part](i) if 4.0 <= i.t_s < 8.5 and tick < 4 else i
+        return list(BROKEN.values())[part](i) if 2.0 <= i.t_s < 6.5 and tick < 4 else i
 
     result = short_flown(change)
     assert result.outputs[-1].outcome is Outcome.COMPLETED
@@ -262,7 +255,7 @@ def test_broken_values_for_a_moment_never_reach_the_law_and_the_mission_goes_on(
 
 def test_broken_values_for_good_are_a_lost_device() -> None:
     """Of the other parts: tests/safety/test_rules.py."""
-    result = short_flown(lambda i: BROKEN["vehicle"](i) if i.t_s >= 7.0 else i)
+    result = short_flown(lambda i: BROKEN["vehicle"](i) if i.t_s >= 5.0 else i)
     assert "vehicle_state_lost" in event_ids(result)
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert not result.crashed
@@ -270,7 +263,7 @@ def test_broken_values_for_good_are_a_lost_device() -> None:
 
 def test_poses_of_another_body_are_not_passed_on_and_px4_lands() -> None:
     def change(i: Inputs) -> Inputs:
-        if i.mocap is None or i.t_s < 7.2:
+        if i.mocap is None or i.t_s < 5.2:
             return i
         x, y, z = i.mocap.position_world_m
         return replace(i, mocap=replace(i.mocap, position_world_m=(x + 0.8, y, z)))
@@ -279,8 +272,8 @@ def test_poses_of_another_body_are_not_passed_on_and_px4_lands() -> None:
     ids = event_ids(result)
     assert ids[:3] == ["takeoff", "mocap_jump", "mocap_swapped"]
     swapped = next(e for o in result.outputs for e in o.events if e.id == "mocap_swapped")
-    assert swapped.t_s - 7.2 < short().vehicle.safety.mocap_timeout_s + 0.05
-    assert all(o.mocap_trusted == (o.t_s < 7.2) for o in result.outputs if o.t_s < 9.2)
+    assert swapped.t_s - 5.2 < short().vehicle.safety.mocap_timeout_s + 0.05
+    assert all(o.mocap_trusted == (o.t_s < 5.2) for o in result.outputs if o.t_s < 7.2)
 
 
 # -- nothing is sent again -------------------------------------------------------------------------------------------
@@ -288,14 +281,14 @@ def test_poses_of_another_body_are_not_passed_on_and_px4_lands() -> None:
 
 @cache
 def ordinary() -> FastResult:
-    return FastFlight(short()).run(limit_s=5.5)
+    return FastFlight(short()).run(limit_s=3.5)
 
 
 @pytest.mark.parametrize("part", ["vehicle", "arm"])
 def test_no_command_answers_a_state_that_is_older_than_it_may_be(part: str) -> None:
     """The link falls silent: the edge goes on showing the last state. Attitude ends within 100 ms, torque within 50 ms."""
     inputs = ordinary().inputs
-    begin = next(k for k, i in enumerate(inputs) if i.t_s >= 5.0)
+    begin = next(k for k, i in enumerate(inputs) if i.t_s >= 3.0)
     core = FlightCore(FastFlight(short()).config)
     for i in inputs[:begin]:
         core.step(i)

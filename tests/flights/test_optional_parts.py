@@ -22,7 +22,7 @@ from tests.flights.ends import flown_until
 from tests.machines import overrides_with_joints
 from tests.support import CATCH, HOVER, LOW_HOVER, SHORT_CATCH
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 NO_FORCE, NO_TETHER, NO_TOOL = "vehicle.devices.force=null", "vehicle.tether=null", "vehicle.tool=null"
 NO_PART = (NO_FORCE, NO_TETHER, NO_TOOL, "mission.catch=null")

@@ -21,7 +21,7 @@ from sitl.fast.loop import FastFlight
 from sitl.gym.environment import FlightEnvironment
 from tests.support import SHORT_CATCH
 
-pytestmark = pytest.mark.usefixtures("short_wait")  # every reset flies it
+pytestmark = pytest.mark.usefixtures("short_start")  # every reset flies it
 
 
 def made(name: str, **settings: Any) -> FlightEnvironment:

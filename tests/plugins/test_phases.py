@@ -31,7 +31,7 @@ from sitl.testing import check_flight
 from tests.plugins.installed import on_path, write_distribution
 from tests.support import ROOT
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 EXAMPLE = ROOT / "examples/phase"
 MISSION = EXAMPLE / "weigh.yaml"

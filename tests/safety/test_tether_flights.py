@@ -15,7 +15,7 @@ from sitl.world.state import Truth
 from tests.safety.test_tether import ANCHOR, config, vehicle
 from tests.support import tether_of
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 
 def event_ids(result: FastResult) -> list[str]:

@@ -27,7 +27,7 @@ from sitl.mocap import MocapFrame
 from tests.sitl.px4_rig import Rig
 from tests.support import DEADLINE_S, HOVER, HOVERS_S, LOW_HOVER, SHORT_CATCH
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 EXTERNAL = "vehicle.devices.mocap.type=external"
 

@@ -24,7 +24,7 @@ from sitl.fast.result import FastResult
 from sitl.faults.timing import FaultError, with_fault_times
 from tests.support import CATCH, HOVER, SHORT_CATCH
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 CONFIG = load_sitl(CATCH, preset="recommended")
 LINE_M_S = 0.74

@@ -14,7 +14,7 @@ from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from tests.support import SHORT_CATCH
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 LIMIT_M = Safety().mocap_inertial_m
 ONLY_VIBRATION = {

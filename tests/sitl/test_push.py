@@ -26,7 +26,7 @@ from companion.sitl_config.world import Push
 from sitl.fast.loop import FastFlight
 from sitl.faults.timing import ARMED_SEEN_S
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 DOWN: Vec3 = (0.0, 0.0, -2.0)
 BACK: Vec3 = (-2.0, 0.0, 0.0)

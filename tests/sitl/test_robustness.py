@@ -17,7 +17,7 @@ from sitl.campaigns import flights, robustness
 from sitl.campaigns.flights import Flown
 from tests.support import CATCH, HOVER, SHORT_CATCH
 
-pytestmark = pytest.mark.usefixtures("short_wait")
+pytestmark = pytest.mark.usefixtures("short_start")
 
 CONFIG = load_sitl(CATCH, preset="recommended")
 PLACES = robustness.throws(CONFIG.mission, CONFIG.vehicle)

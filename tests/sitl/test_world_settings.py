@@ -39,7 +39,7 @@ PLATE = {"point_m": (-0.544, -0.03, 0.136), "normal": (0.1, 0.1, 1.0), "size_m":
 
 
 @pytest.fixture(autouse=True)
-def _short(short_wait: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def _short(short_start: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """A flight with faults that is ended in the air is not followed to the floor."""
     monkeypatch.setattr("sitl.fast.loop.SETTLE_S", 0.0)
 
@@ -73,7 +73,7 @@ def test_every_setting_is_read_by_the_simulated_world(monkeypatch: pytest.Monkey
     waiting = overrides(throw_to="hovering", people=people, catch_at_m=[-1.0, 0.0], payload_kg=0.2)
     handled = overrides(handling=True, handling_t_s=0.0, handling_taps=1, net_weight_kg=0.5, net_weight_t_s=0.4)
     flights = [
-        (load_sitl(SHORT_CATCH, overrides=[*on, *catch, "vehicle.devices.mocap.ball={kind: marker}"]), 8.3),
+        (load_sitl(SHORT_CATCH, overrides=[*on, *catch, "vehicle.devices.mocap.ball={kind: marker}"]), 7.3),
         (
             load_sitl(
                 HOVER, vehicle_path="tarot650_2r_rod", overrides=overrides(surfaces=[{**PLATE, "gives_way_n": 8.0}])
@@ -81,7 +81,7 @@ def test_every_setting_is_read_by_the_simulated_world(monkeypatch: pytest.Monkey
             0.6,
         ),
         (load_sitl(HOVER, overrides=handled), 0.6),
-        (load_sitl(HOVER, overrides=waiting), 9.5),
+        (load_sitl(HOVER, overrides=waiting), 8.5),
     ]
     pair = load_team("carry", ["world.bar={}"])
     read: set[str] = set()
@@ -116,7 +116,7 @@ ELSEWHERE_FLOWN = {
     "payload_dropped": "test_faults.py: it is felt no more",
 }
 """Kinds of faults, for most of which a flight to the catch is needed, whose effect is measured elsewhere."""
-UNTIL_S = 8.3
+UNTIL_S = 7.3
 """Flight time that includes the catch."""
 
 
