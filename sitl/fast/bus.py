@@ -139,7 +139,7 @@ class FastBus:
                     self._set(faults, counts)
                 else:
                     self._waiting_counts = counts
-        elif faults is not None and t_s - self._goal_s > self._watchdog_s and not faults.packet_lost():
+        elif t_s - self._goal_s > self._watchdog_s and (faults is None or not faults.packet_lost()):
             # As the bus thread does with a stale goal; a servo that is lost has its own watchdog.
             self._set(faults, [0] * len(self._drives))
 
