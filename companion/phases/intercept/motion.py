@@ -34,7 +34,7 @@ STOP_LEAST_S: Final = 0.5
 PIECES: Final = 3
 """Number of pieces of a motion that are compared with the limits: the coefficients of a short piece are close to the curve."""
 OVERSHOOT: Final = 1.4
-"""Speed of the body, as a multiple of the reference's, for which there is room to stop if its lags are not known."""
+"""Speed of the body, as a multiple of the reference's, for which there is room to stop: vertically, and if its lags are not known."""
 LOOK_S, LOOKS = 0.04, 9
 """Times after the start of a stop at which there must be room for the lagging body to stop: it goes on after the reference."""
 BRAKE_M_S2: Final = 2.0
@@ -161,7 +161,7 @@ class Bounds:
             s = m.at(m.start_s + k * LOOK_S)
             lag = lag.after(LOOK_S, s.acceleration_m_s2) if k else lag
             (x, y), (vx, vy) = lag.body_m(), lag.body_m_s(s.acceleration_m_s2)
-            v = _plus(s.velocity_m_s, (vx, vy, 0.0), 1.0)
+            v = _plus(s.velocity_m_s, (vx, vy, (OVERSHOOT - 1.0) * s.velocity_m_s[2]), 1.0)
             if not self._safe.holds(_plus(_plus(s.position_m, (x, y, 0.0), 1.0), v, self._stop.time_s(math.hypot(*v)))):
                 return False
         return True
