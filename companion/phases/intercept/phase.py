@@ -276,7 +276,9 @@ class Intercept(Phase):
         if s.mode not in PUSHED:
             return s
         bounds = self._bounds(air, s)
-        now = bounds.pushed(air.t_s, s.now, air.dt_s, push_of(air, s)(air.t_s), s.lag)
+        # A dodge is pushed as it was judged: without the lags.
+        lag = s.lag if s.mode is Mode.CHASE else None
+        now = bounds.pushed(air.t_s, s.now, air.dt_s, push_of(air, s)(air.t_s), lag)
         if now is None:
             now = bounds.stop(air.t_s - air.dt_s, s.now).at(air.t_s)
         return replace(s, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
