@@ -1,7 +1,8 @@
 /* Reads of a record's field, of a module's name and of a float in the compiled modules.
 
-Each place in the code remembers the version of the object's type and the field's offset, as CPython's interpreter does (LOAD_ATTR_SLOT).
-mypyc searches the type for the name at every read, which made up a fifth of a control tick. A changed type has another version.
+Each place in the code remembers the version of the object's type and the field's offset, as CPython's interpreter does (LOAD_ATTR_SLOT),
+and the name: that of `getattr` may be another one each time. mypyc searches the type for the name at every read, which made up a fifth of a
+control tick. A changed type has another version.
 */
 #if defined(__GNUC__) && !defined(Py_GIL_DISABLED) && __has_include("CPy.h")
 #include <Python.h>
@@ -9,6 +10,7 @@ mypyc searches the type for the name at every read, which made up a fifth of a c
 #include "CPy.h"
 
 typedef struct {
+    PyObject *name; /* owned, so that no other string has its address */
     unsigned int version;
     Py_ssize_t offset; /* 0 if the place has not read a field yet: an object begins with its reference count */
 } CompanionField;
@@ -21,6 +23,8 @@ static PyObject *companion_find_field(PyObject *object, PyObject *name, Companio
         type->tp_getattro == PyObject_GenericGetAttr && PyType_HasFeature(type, Py_TPFLAGS_VALID_VERSION_TAG)) {
         PyMemberDef *found = ((PyMemberDescrObject *)member)->d_member;
         if (found->type == T_OBJECT_EX) {
+            Py_INCREF(name);
+            Py_XSETREF(field->name, name);
             field->version = type->tp_version_tag;
             field->offset = found->offset;
         }
@@ -29,7 +33,7 @@ static PyObject *companion_find_field(PyObject *object, PyObject *name, Companio
 }
 
 static inline PyObject *companion_field(PyObject *object, PyObject *name, CompanionField *field) {
-    if (field->offset != 0 && Py_TYPE(object)->tp_version_tag == field->version) {
+    if (field->name == name && field->offset != 0 && Py_TYPE(object)->tp_version_tag == field->version) {
         PyObject *value = *(PyObject **)((char *)object + field->offset);
         if (value != NULL) {
             return Py_NewRef(value);

@@ -36,6 +36,7 @@ FLIGHTS = [
     ("press", "adaptive", "recommended", "wall", ""),
     ("press", "adaptive", "recommended", "wall", "", "vehicle.force_source=observer"),
     ("slide", "adaptive", "recommended", "wall", "", "mission.phases[4].displacement_m=[0.0,-0.2]"),
+    ("intercept", "adaptive", "recommended", "careless", ""),
     ("probe", "adaptive", "recommended", "wall", "", "mission.phases[3].rows=2", "mission.phases[3].columns=2"),
 ]
 CAMPAIGNS = [
