@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import re
 import shlex
@@ -55,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     from companion.install.extras import missing_extra
     from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
     from companion.plugins import PluginError
-    from companion.runtime.console import print_error
+    from companion.runtime.console import SteadyStream, print_error
 
     if unknown:
         print_error(
@@ -69,12 +70,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return EXIT_REFUSED
     try:
         code: int = arguments.run(arguments)
+        sys.stdout.flush()
     except (ConfigError, PluginError) as error:
         for line in error.lines if isinstance(error, ConfigError) else (error,):
             print_error(line)
         return EXIT_BAD_INPUT
-    except BrokenPipeError:
-        return EXIT_OK
+    except OSError as error:
+        if error.errno not in (errno.EPIPE, errno.ENOSPC) or error.filename is not None:
+            raise
+        SteadyStream(sys.stdout).discard()
+        if error.errno == errno.EPIPE:
+            return EXIT_OK
+        print_error(f"companion {arguments.command}: standard output cannot be written: {error.strerror}")
+        return EXIT_BAD_INPUT
     except KeyboardInterrupt:
         print_error(f"companion {arguments.command}: interrupted")
         return EXIT_ABORTED

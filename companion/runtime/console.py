@@ -47,7 +47,7 @@ class SteadyStream:
         try:
             return self._stream.write(text)
         except OSError:
-            self._discard()
+            self.discard()
             return len(text)
 
     def flush(self) -> None:
@@ -55,12 +55,13 @@ class SteadyStream:
         try:
             self._stream.flush()
         except OSError:
-            self._discard()
+            self.discard()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
-    def _discard(self) -> None:
+    def discard(self) -> None:
+        """Discard all text from now on."""
         # The interpreter flushes once more at its end, and would change the exit code if that failed.
         with contextlib.suppress(OSError), open(os.devnull, "wb") as nowhere:
             os.dup2(nowhere.fileno(), self._stream.fileno())

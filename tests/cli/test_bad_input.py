@@ -8,6 +8,8 @@ from __future__ import annotations
 import re
 import shlex
 import socket
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -222,3 +224,13 @@ def test_the_line_that_a_copy_of_the_files_suggests_flies_from_any_folder(
     assert main(["init", str(tmp_path / "my files")]) == EXIT_OK
     line = capsys.readouterr().out.splitlines()[-1].removeprefix("try: ")
     assert shlex.split(line) == ["companion", "fly", str(tmp_path / "my files/missions/catch.yaml"), "--sitl"]
+
+
+def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    with open("/dev/full", "w") as full:
+        ended = subprocess.run(
+            [sys.executable, "-P", "-m", "companion", "schema", "mission"],
+            stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+        )  # fmt: skip
+    assert ended.returncode == EXIT_BAD_INPUT
+    assert ended.stderr.splitlines() == ["companion schema: standard output cannot be written: No space left on device"]
