@@ -25,7 +25,7 @@ from companion import DISTRIBUTION
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.campaigns.process import CampaignError, CampaignProcess, Message
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
-from companion.runtime.console import print_error
+from companion.runtime.console import console_on, print_error
 from companion.runtime.subprocesses import signals_call
 from companion.sitl_config.loader import SitlConfig
 
@@ -197,7 +197,7 @@ def _progress(campaign: Campaign, newest: Message, bad: int) -> str:
 
 def progress_bar() -> Progress:
     """Return a progress bar on standard error, which is shown on a terminal only."""
-    console = Console(stderr=True)
+    console = console_on(sys.stderr)
     return Progress(
         TextColumn("flying"),
         BarColumn(bar_width=32),

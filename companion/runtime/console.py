@@ -93,8 +93,10 @@ def prefixed_console(prefix: str) -> Console:
 
 
 def console_on(stream: TextIO) -> Console:
-    """Return a console on a stream whose reader may disappear."""
-    return Console(file=cast("IO[str]", _PlainNumbers(stream)))
+    """Return a console on a stream whose reader may disappear. A progress bar is for terminals: `FORCE_COLOR`,
+    which notebooks and CI set, makes none of a file.
+    """
+    return Console(file=cast("IO[str]", _PlainNumbers(stream)), force_terminal=stream.isatty())
 
 
 def terminal_console() -> Console:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 from pathlib import Path
 
+import pytest
 from rich.console import Console
 
 from companion.flight.control_loop import status_of
 from companion.model.launcher_messages import AnyMessage, FlightEvent, Started
 from companion.model.outputs import Outputs
-from companion.runtime.console import FlightDisplay, print_result
+from companion.runtime.console import FlightDisplay, console_on, print_result
 from companion.runtime.realtime import Realtime
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
@@ -73,3 +74,9 @@ def test_every_step_of_a_flight_is_printed_once() -> None:
     assert [step for step in steps if "caught" not in step] == [
         "wait", "offboard", "arm", "spool up", "take-off", "catch", "hold", "land", "touchdown", "disarm", "done",
     ]  # fmt: skip
+
+
+def test_a_file_is_no_terminal_whatever_force_color_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Notebooks and CI set it: a campaign wrote tens of thousands of lines of its progress there."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    assert not console_on(io.StringIO()).is_terminal

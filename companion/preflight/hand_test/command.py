@@ -23,6 +23,7 @@ from companion.preflight.checks import Check
 from companion.preflight.hand_test import evaluation as hand_test_evaluation
 from companion.preflight.hand_test import record as hand_record
 from companion.preflight.hand_test.steps import INSTRUCTIONS, HandResult, HandSample, HandTest, HandView, Step
+from companion.runtime.console import console_on
 from companion.runtime.terminal import Bars, pressed, raw_keys
 
 LOOK_PERIOD_S: Final = 0.004
@@ -80,7 +81,7 @@ async def perform(
     test, clock, arm_due_s = HandTest(), _StampClock(), 0.0
     stop = asyncio.Event()
     if json and console.file is sys.stdout:
-        console = Console(stderr=True)
+        console = console_on(sys.stderr)
     console.print(
         "[bold]hand test[/]  battery connected, motors disarmed, propellers off; the operator carries the vehicle "
         "(any key ends the test)"
