@@ -71,7 +71,7 @@ class ChannelsTarget(Target):
             self._client.error = None
             self._hear(b'{"error": "disk full"}')
             one_line(self._client.error or "", "the recorder's word")
-            self._hear(b'{"command": "land", "operator": "anna", "nonce": "00", "hold": 0}')
+            self._hear(b'{"command": "land", "operator": "anna", "nonce": "00", "hold": 0, "t_s": 1.5}')
             if [asked.command for asked in self._client.take_commands()] != [OperatorCommand.LAND]:
                 raise Wrong("a valid command behind it is not heard")
 
