@@ -151,7 +151,7 @@ def test_the_example_keeps_the_contract(monkeypatch: pytest.MonkeyPatch) -> None
     ("name", "options", "found"),
     [
         ("raising", {"after": 30}, "reads failed: OSError: bus off"),
-        ("unwritable", {"after": 60}, r"reads failed: RuntimeError: write_torque\(\) raised OSError: buffer full"),
+        ("unwritable", {"after": 60}, "reads failed: .*OSError: buffer full"),
         ("nan", {"after": 30}, "reads failed: ValueError: .* for joint 1, expected finite values"),
         ("faulty", {"after": 30}, "servo 1: fault of the motor: see the log"),
         ("stays", {}, "still running after the arm was closed: arm-bus"),
