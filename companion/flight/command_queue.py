@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import signal
 import socket
 from collections.abc import Callable, Coroutine, Iterable, Iterator
@@ -97,8 +96,8 @@ class Operator:
         if not waiting or waiting[0].command is self._given:
             self._given = OperatorCommand.NONE
             return TickCommand(OperatorCommand.NONE, None)
-        age_s, limit_s = t_s - waiting[0].t_s, _AGE_MAX_S.get(waiting[0].command, math.inf)
-        if age_s > limit_s:
+        age_s, limit_s = t_s - waiting[0].t_s, _AGE_MAX_S.get(waiting[0].command)
+        if limit_s is not None and not age_s <= limit_s:
             asked, self._given, self._checking = waiting.pop(0), OperatorCommand.NONE, None
             text = f"{asked.command.value} refused: it was given {age_s:.1f} s ago (limit {limit_s:.1f} s)"
             return TickCommand(OperatorCommand.NONE, asked, f"{text}; check the situation, then command it again")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import socket
 from collections.abc import Iterator
 
@@ -172,6 +173,8 @@ def test_a_start_or_resume_that_waited_too_long_is_refused_and_a_stop_is_not(
     assert late.refused == f"start refused: it was given 2.1 s ago (limit 2.0 s); {advice}"
     operator.ask(asked(RESUME))
     assert operator.next(30.0).refused == f"resume refused: it was given 30.0 s ago (limit 2.0 s); {advice}"
+    operator.ask(asked(START))
+    assert (operator.next(math.nan).refused or "").startswith("start refused"), "no age is not a small one"
     for stop in (HOLD, LAND, ABORT):
         operator.ask(asked(stop))
         assert operator.next(30.0) == TickCommand(stop, asked(stop)[0])

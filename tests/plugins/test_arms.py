@@ -151,7 +151,7 @@ def test_the_example_keeps_the_contract(monkeypatch: pytest.MonkeyPatch) -> None
     ("name", "options", "found"),
     [
         ("raising", {"after": 30}, "reads failed: OSError: bus off"),
-        ("unwritable", {"after": 60}, "reads failed: .*OSError: buffer full"),
+        ("unwritable", {"after": 60}, r"reads failed: RuntimeError: write_torque\(\) raised OSError: buffer full"),
         ("nan", {"after": 30}, "reads failed: ValueError: .* for joint 1, expected finite values"),
         ("faulty", {"after": 30}, "servo 1: fault of the motor: see the log"),
         ("stays", {}, "still running after the arm was closed: arm-bus"),
@@ -178,7 +178,7 @@ def test_an_arm_where_there_is_none_breaks_the_contract() -> None:
         ("unmade", r"arm 'unmade' \(lab-arm 1.0\): cannot be opened: TypeError: "),
         ("nooff", r"arm 'nooff' \(lab-arm 1.0\): its class has no method torque_off\(\)"),
         ("raising", r"\(lab-arm 1.0\): cannot be opened: OSError: bus off$"),
-        ("unwritable", r"\(lab-arm 1.0\): failed while being set up: OSError: buffer full"),
+        ("unwritable", r"\(lab-arm 1.0\): failed while being set up: RuntimeError: write_torque\(\) raised OSError: buffer full"),
         ("nan", r"cannot be opened: ValueError: read\(\) returned .* for joint 1, expected finite values"),
         ("short", r"cannot be opened: TypeError: read\(\) returned 1 states, expected 2, one for each joint"),
         ("wrong", r"cannot be opened: TypeError: read\(\) returned \(0.5, -0.25\), expected a list of MotorState"),

@@ -147,7 +147,7 @@ class PluginArm(ThreadedArm[tuple[MotorState, ...], Joints]):
             self._motors.write_torque(goal)
         except Exception as error:  # the next read then counts as failed
             self._write_problem = f"write_torque() raised {one_line(error)}"
-            raise
+            raise RuntimeError(self._write_problem) from error
 
     def _restart_watchdogs(self) -> None:
         """Do nothing: a plug-in never reports `WATCHDOG_ERROR`."""
