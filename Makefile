@@ -55,16 +55,20 @@ compile: install
 	@$(BIN)/python -m tools.compiled
 
 # Every figure of docs/internals/compare.md, flown again: make figures FLY=--plan says how long it takes, FLY="--scheduler ADDRESS" flies
-# on the workers of Dask.
+# on the workers of Dask, which need examples/baselines installed.
 COMPARE := $(BIN)/companion compare --world lab --first-seed 2001
 SOFT := examples/compare/psc_soft.yaml,examples/compare/csc_soft.yaml
+ALL_LAWS := adaptive,psc,csc,pid,indi,l1,mpc
+BEST := recommended,model_free,tuned,tuned_extras,recommended_equal
 ONE_LAW := --controllers adaptive --payloads 0.2
+figures: export PYTHONPATH := $(CURDIR):$(CURDIR)/build/baselines
 figures: install
+	@rm -rf build/baselines; $(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target build/baselines examples/baselines
 	@set -e; fly() { out=$$1; shift; echo "$$out"; $(COMPARE) "$$@" --out $(FIGURES)/$$out $(FLY); }; \
-	fly laws --seeds 50 --controllers adaptive,psc,csc,$(SOFT); \
-	fly model_error --seeds 50 --presets recommended,model_free,tuned,tuned_extras --payloads 0.2 --model-error 0.2; \
+	fly laws --seeds 50 --controllers $(ALL_LAWS),$(SOFT); \
+	fly model_error --seeds 100 --controllers $(ALL_LAWS) --presets $(BEST) --payloads 0.2 --model-error 0.2; \
 	fly adaptation --seeds 200 $(ONE_LAW) --presets recommended,model_free --adaptation on,off --model-error 0.2; \
-	fly ablation --seeds 100 $(ONE_LAW) --presets recommended --ablation; \
+	fly ablation --seeds 50 $(ONE_LAW) --presets recommended --ablation; \
 	test "$(FLY)" = --plan || $(BIN)/python -m tools.docs.compare docs/internals/compare.md $(FIGURES)/*/compare.json
 
 # The checks of make lint are among the tests. The same examples, checks and skips for everybody.

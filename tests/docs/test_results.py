@@ -101,6 +101,14 @@ def compared(world: str = "lab", first_seed: int = 1) -> dict[str, Any]:
     return {"rows": rows, "settings": {"world": world, "command": command}, "versions": {"git": 40 * "a"}}
 
 
+def test_the_baselines_have_a_table_of_their_own() -> None:
+    results = compared()
+    results["rows"] += [compare_row({**FLIGHT, "controller": "pid", "preset": "tuned", "seed": 1}, 0.3)]
+    made = compare_doc.tables([results])
+    assert "| pid/tuned |" in made["baselines"]
+    assert "pid" not in made["published"]
+
+
 def test_the_page_says_how_the_laboratory_differs_from_the_paper() -> None:
     made = compare_doc.tables([compared(first_seed=1), compared(first_seed=4)])
     assert "0.200 m at 0.2 kg (printed: 0.165, ratio 1.2)" in made["differences"]

@@ -34,7 +34,7 @@ FLIGHTS = [
     ("hover", "adaptive", "recommended", "lab", "tarot650_4r"),
     ("hover", "adaptive", "recommended", "lab", "hexa_2r"),
     ("press", "adaptive", "recommended", "wall", ""),
-    ("press", "adaptive", "recommended", "wall", "", "vehicle.force_source=observer"),
+    ("press", "adaptive", "recommended", "wall", "", "vehicle.force_source=observer", "world.seed=2"),
     ("slide", "adaptive", "recommended", "wall", "", "mission.phases[4].displacement_m=[0.0,-0.2]"),
     ("intercept", "adaptive", "recommended", "careless", ""),
     ("probe", "adaptive", "recommended", "wall", "", "mission.phases[3].rows=2", "mission.phases[3].columns=2"),

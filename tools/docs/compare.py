@@ -33,6 +33,8 @@ MISSION = Path(__file__).parents[2] / "configs/missions/catch.yaml"
 """Mission with which a configuration is loaded; only the configuration's controller is used."""
 Results = dict[str, Any]
 """Content of a compare.json."""
+LAWS = ("adaptive", "csc", "psc")
+"""The companion's own laws of the comparison; others are baselines."""
 AS_PUBLISHED = ("paper", "paper_slow_leakage", "tuned", "soft")
 """Presets that contain only what the law's paper describes; all others have additional compensation."""
 IN_PAPER = {"adaptive/paper": "proposed", "psc/tuned": "PSC", "csc/tuned": "CSC"}
@@ -162,7 +164,7 @@ def differences_markdown(groups: Sequence[Group]) -> str:
 
 def knowledge_markdown() -> str:
     """Return the vehicle parameters that each built-in preset uses, and those that it estimates in flight."""
-    named = [(law, preset) for law, presets in PRESETS.items() for preset in presets]
+    named = [(law, preset) for law in LAWS for preset in PRESETS[law]]
     loaded = [load_flight(MISSION, controller_law=law, preset=preset).controller for law, preset in named]
     configs = [controller for controller in loaded if isinstance(controller, LawConfig)]
     head = ("law/preset", *(title for title, _ in _TOLD), "adapted or estimated in flight")
@@ -259,8 +261,10 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
     groups = by_payload(aggregate(merged(files)))
     whole = [group for group in groups if not is_ablation(group.preset)]
     first = [group for group in whole if group.model_error == min(one.model_error for one in groups)]
-    published = [group for group in first if group.preset in AS_PUBLISHED]
-    extras = [group for group in first if group.preset not in AS_PUBLISHED]
+    built_in = [group for group in first if group.controller in LAWS]
+    published = [group for group in built_in if group.preset in AS_PUBLISHED]
+    extras = [group for group in built_in if group.preset not in AS_PUBLISHED]
+    baselines = [group for group in first if group.controller not in LAWS]
     errors_of = Counter((group.label, group.payload_kg) for group in whole)
     by_error = [group for group in whole if errors_of[group.label, group.payload_kg] > 1]
     off = {
@@ -278,6 +282,7 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
     made: dict[str, tuple[Callable[[Sequence[Group]], str], Sequence[Group]]] = {
         "published": (against, published),
         "extras": (against, extras),
+        "baselines": (against, baselines),
         "model error": (model_error_markdown, by_error),
         "adaptation": (adaptation_markdown, paired),
         "ablation": (ablation_markdown, ablated),
