@@ -28,7 +28,8 @@ FLIGHT_CODE = (
     "sitl",
 )
 """What the figures of a flight depend on."""
-_COMMIT = re.compile(r"\bat commit ([0-9a-f]{7,40})\b")
+COMMIT = re.compile(r"(?:\bcommit\s+|\b(?=\d*[a-f]))([0-9a-f]{7,40})\b")
+"""A word that may be a commit's name: pages also say `at 1c535d28`, `commit` before a line break, or lists of them."""
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)")
 
 
@@ -70,8 +71,12 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         return posixpath.relpath(_uri(linked), posixpath.dirname(uri) or ".")
 
     root = Path(config.config_file_path).parent
-    markdown = _COMMIT.sub(lambda found: found[0] + _age(found[1], root), markdown)
-    return _outside_of_fences(markdown, lambda text: re.sub(r"^ {3}(?=\S)", " " * 4, _LINK.sub(led, text), flags=re.M))
+
+    def changed(text: str) -> str:
+        text = COMMIT.sub(lambda found: found[0] + _age(found[1], root), text)
+        return re.sub(r"^ {3}(?=\S)", " " * 4, _LINK.sub(led, text), flags=re.M)
+
+    return _outside_of_fences(markdown, changed)
 
 
 @cache

@@ -16,6 +16,7 @@ from companion.model.types import SafetyAction
 from companion.model.units import unit_of
 from companion.safety.rule import Rule
 from companion.safety.rules import RULES
+from docs.site_hooks import COMMIT
 from tests.support import DEADLINE_S
 from tools.docs.reference import page
 
@@ -86,6 +87,21 @@ def test_figures_say_how_far_they_are_behind_the_code(site: Path) -> None:
         command = ["git", "rev-list", "--count", f"{commit}..HEAD", "--", "companion/control", "sitl"]
         counted = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         assert int(later or 0) >= int(counted.stdout or 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "commits"),
+    [
+        ("flown at commit 8f25a11a.", ["8f25a11a"]),
+        ("flown\nat commit\n1c535d28, seed 301", ["1c535d28"]),
+        ("(169 of 200 at c9ff310e, compiled)", ["c9ff310e"]),
+        ("commits a4b62edf and `e858b80e`", ["a4b62edf", "e858b80e"]),
+        ("commit 12345678", ["12345678"]),
+        ("2000000 baud in 57600000 flights of a facade", []),
+    ],
+)
+def test_a_commit_is_found_in_every_form_that_pages_use(text: str, commits: list[str]) -> None:
+    assert COMMIT.findall(text) == commits
 
 
 # -- the reference -----------------------------------------------------------------------------------------------------
