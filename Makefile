@@ -63,7 +63,8 @@ BEST := recommended,model_free,tuned,tuned_extras,recommended_equal
 ONE_LAW := --controllers adaptive --payloads 0.2
 figures: export PYTHONPATH := $(CURDIR):$(CURDIR)/build/baselines
 figures: install
-	@rm -rf build/baselines; $(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target build/baselines examples/baselines
+	@rm -rf build/baselines; mkdir -p build/baselines; cp -r examples/baselines build/baselines/source
+	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --target build/baselines build/baselines/source
 	@set -e; fly() { out=$$1; shift; echo "$$out"; $(COMPARE) "$$@" --out $(FIGURES)/$$out $(FLY); }; \
 	fly laws --seeds 50 --controllers $(ALL_LAWS),$(SOFT); \
 	fly model_error --seeds 100 --controllers $(ALL_LAWS) --presets $(BEST) --payloads 0.2 --model-error 0.2; \

@@ -1,14 +1,18 @@
-"""Flies the catch in the ideal world with one effect of the laboratory at a time, and shows the position error that each causes.
+"""Which effect of the laboratory matters: each is added in a random order to the ideal world, until it is the laboratory.
 
     python -m benchmarks.effects --table effects.md --picture docs/internals/pictures/effects.png
 
-An effect is drawn as in the laboratory of the same seed. Its cost is the median over laboratories of the difference in RMS ||e_p|| from
-the ideal flight with the same seed and payload. A flight that was not completed has no cost.
+Each laboratory adds the effects in an order of its own. What an effect adds to the RMS ||e_p|| after the catch is thus measured beside
+many other effects, and the means add up to the difference between laboratory and ideal world: they are Shapley values, estimated from
+permutations (Castro et al., 2009). Every law flies the same worlds in the same order, so that the same holds for the difference between
+two laws: an effect whose share in it is certain could turn their order. A flight that is not completed with the payload says nothing
+about the effects before and after it.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -42,106 +46,110 @@ EFFECTS = {
     "compliance": ("compliance",),
 }
 """Keys of the world that belong to each effect."""
-NONE, ALL = "ideal world", "laboratory"
+IDEAL, LABORATORY = "ideal world", "laboratory"
 
-Errors = tuple[float, float]
-"""RMS ||e_p|| of one flight before and after the catch, m; NaN if that part was not completed."""
+Errors = np.ndarray[tuple[int, int], np.dtype[np.float64]]
+"""RMS ||e_p|| after the catch, mm: one row per laboratory, one column per number of effects; NaN without the payload."""
 
 
-def with_effect(config: SitlConfig, ideal: World, effect: str) -> SitlConfig:
-    """Return the configuration of a laboratory in which only one effect acts, by its name; or `NONE`, or `ALL`."""
-    if effect == ALL:
-        return config
-    kept = ("seed", *EFFECTS.get(effect, ()))
+def order(seed: int) -> list[str]:
+    """Return the order in which the laboratory with this seed adds the effects."""
+    return [list(EFFECTS)[k] for k in np.random.default_rng(seed).permutation(len(EFFECTS))]
+
+
+def with_effects(config: SitlConfig, ideal: World, effects: Sequence[str]) -> SitlConfig:
+    """Return the configuration of a laboratory in which only these effects act, each with its values in the whole laboratory."""
+    kept = {"seed", *(key for effect in effects for key in EFFECTS[effect])}
     return with_world(config, {key: value for key, value in ideal.model_dump(mode="json").items() if key not in kept})
 
 
-def fly(configs: Mapping[tuple[str, str], SitlConfig], flight: tuple[str, str, int]) -> Errors:
-    """Fly one law with one effect in one laboratory."""
-    law, effect, seed = flight
-    changes = {"seed": seed, "payload_kg": PAYLOADS_KG[seed % len(PAYLOADS_KG)]}
-    flown = fly_to_end(with_world(configs[law, effect], changes))
-    rms = row_of(flown.config.flight, flown.result, flown.caught_t_s, flown.error)[0]["rms"]
-    before, after = rms["pre"]["e_p_m"], rms["post"]["e_p_m"]
-    return (np.nan if before is None else before, np.nan if after is None else after)
+def fly(loaded: Mapping[str, SitlConfig], ideal: World, flight: tuple[str, int, int]) -> float:
+    """Fly a law in the laboratory of a seed with the first effects of its order, and return its entry of `Errors`."""
+    law, seed, number = flight
+    payload_kg = PAYLOADS_KG[seed % len(PAYLOADS_KG)]
+    laboratory = with_effects(loaded[law], ideal, order(seed)[:number])
+    flown = fly_to_end(with_world(laboratory, {"seed": seed, "payload_kg": payload_kg}))
+    after_m = row_of(flown.config.flight, flown.result, flown.caught_t_s, flown.error)[0]["rms"]["post"]["e_p_m"]
+    return float(np.nan if after_m is None else 1e3 * after_m)
 
 
-def costs_mm(flown: Mapping[tuple[str, str, int], Errors], law: str, effect: str) -> tuple[float, float, int]:
-    """Return the cost before and after the catch, mm, and the number of completed flights; `NONE` has its errors themselves."""
-    seeds = sorted({seed for _, _, seed in flown})
+def added_mm(errors: Errors, seeds: Sequence[int]) -> dict[str, tuple[float, float]]:
+    """Return for each effect, and for ideal world and laboratory, the mean of what it adds and half of its 95 % interval, mm."""
+    steps = np.diff(errors, axis=1)
+    of = {
+        effect: np.array([row[order(seed).index(effect)] for row, seed in zip(steps, seeds, strict=True)])
+        for effect in EFFECTS
+    }
+    found = {}
+    for name, values in {IDEAL: errors[:, 0], **of, LABORATORY: errors[:, -1]}.items():
+        known = values[np.isfinite(values)]
+        half = 1.96 * float(np.std(known, ddof=1)) / math.sqrt(len(known)) if len(known) > 1 else math.nan
+        found[name] = (float(np.mean(known)) if len(known) else math.nan, half)
+    return found
 
-    def errors(name: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-        return 1e3 * np.array([flown[law, name, seed] for seed in seeds])
 
-    of_effect = errors(effect)
-    cost = of_effect if effect == NONE else of_effect - errors(NONE)
-    known = [column[np.isfinite(column)] for column in cost.T]
-    before, after = (float(np.median(column)) if len(column) else np.nan for column in known)
-    return before, after, int(np.isfinite(of_effect[:, 1]).sum())
-
-
-def table(flown: Mapping[tuple[str, str, int], Errors], laws: Sequence[str], effects: Sequence[str]) -> str:
-    """Return the costs as a Markdown table."""
-    number = len(flown) // len(laws) // len(effects)
-    heads = [f"{law}, {part}, mm" for law in laws for part in ("before", "after")]
-    lines = ["| effect | " + " | ".join(heads) + " |", "|---" * (1 + len(heads)) + "|"]
-    for effect in effects:
-        cells = []
-        for law in laws:
-            before, after, completed = costs_mm(flown, law, effect)
-            sign = "" if effect == NONE else "+"
-            cells += [f"{before:{sign}.1f}", f"{after:{sign}.1f}"]
-            cells[-1] += f" ({completed} of {number})" if completed < number else ""
-        lines.append(f"| {effect} | " + " | ".join(cells) + " |")
+def table(flown: Mapping[str, Errors], seeds: Sequence[int]) -> str:
+    """Return what each effect adds as a Markdown table, and what it adds to the difference of each law from the first one."""
+    first, *others = flown
+    shown = {f"{law}, mm": errors for law, errors in flown.items()}
+    shown |= {f"{law} - {first}, mm": flown[law] - flown[first] for law in others}
+    columns = {title: added_mm(errors, seeds) for title, errors in shown.items()}
+    lines = ["| effect | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
+    for name in (IDEAL, *EFFECTS, LABORATORY):
+        cells = [f"{mean:+.1f} ± {half:.1f}" for mean, half in (column[name] for column in columns.values())]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
-def draw(flown: Mapping[tuple[str, str, int], Errors], laws: Sequence[str], effects: Sequence[str], path: Path) -> None:
-    """Draw the cost of each effect after the catch as bars."""
+def draw(flown: Mapping[str, Errors], seeds: Sequence[int], path: Path) -> None:
+    """Draw what each effect adds after the catch as bars with their 95 % intervals."""
     figure = new_figure(5.2)
     ax = figure.subplots()
     dress(ax)
-    step = 0.8 / len(laws)
-    for k, law in enumerate(laws):
-        at = np.arange(len(effects)) + (k - (len(laws) - 1) / 2) * step
-        costs = [costs_mm(flown, law, effect)[1] for effect in effects]
-        ax.barh(at, costs, height=0.9 * step, color=COLOURS[k], label=law, zorder=3)
+    step = 0.8 / len(flown)
+    for k, (law, errors) in enumerate(flown.items()):
+        at = np.arange(len(EFFECTS)) + (k - (len(flown) - 1) / 2) * step
+        found = added_mm(errors, seeds)
+        means, halves = zip(*(found[effect] for effect in EFFECTS), strict=True)
+        ax.barh(at, means, xerr=halves, height=0.9 * step, color=COLOURS[k], ecolor=INK, label=law, zorder=3)
     ax.axvline(0.0, color=INK, lw=0.8, zorder=4)
-    ax.set_yticks(range(len(effects)), effects)
+    ax.set_yticks(range(len(EFFECTS)), list(EFFECTS))
     ax.invert_yaxis()
-    ax.set_xlabel(r"additional RMS $\|e_p\|$ after the catch [mm]")
-    figure_legend(figure, "Cost of each effect alone", *ax.get_legend_handles_labels(), columns=4)
+    ax.set_xlabel(r"added to RMS $\|e_p\|$ after the catch [mm]")
+    figure_legend(figure, "What each effect adds, beside the others", *ax.get_legend_handles_labels(), columns=4)
     write_png(figure, path)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return 0, or 2 on bad input."""
-    parser = argparse.ArgumentParser(description="Fly the effects of the laboratory one at a time.")
-    parser.add_argument("--laws", default="adaptive/paper,adaptive/recommended", help="law/preset, ... (%(default)s)")
-    parser.add_argument("--laboratories", type=int, default=8, help="flights per law and effect (%(default)s)")
+    parser = argparse.ArgumentParser(description="Add the effects of the laboratory one after the other.")
+    parser.add_argument(
+        "--laws", default="adaptive/recommended,psc/tuned,csc/tuned", help="law/preset, ... (%(default)s)"
+    )
+    parser.add_argument("--laboratories", type=int, default=40, help="orders of the effects (%(default)s)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (%(default)s)")
     parser.add_argument("--table", type=Path, help="Markdown file to write; absent: standard output")
     parser.add_argument("--picture", type=Path, help="PNG file to write")
     a = parser.parse_args(arguments)
-    laws, effects = a.laws.split(","), (NONE, *EFFECTS, ALL)
+    laws, seeds = a.laws.split(","), range(1, a.laboratories + 1)
     try:
         loaded = {law: load_sitl(MISSION, None, *law.split("/", 1), world="lab") for law in laws}
     except ConfigError as error:
         print(f"effects: {error}", file=sys.stderr)
         return 2
     ideal = load_sitl(MISSION, world="ideal").world
-    configs = {(law, effect): with_effect(loaded[law], ideal, effect) for law in laws for effect in effects}
-    flights = [(*key, seed) for key in configs for seed in range(1, a.laboratories + 1)]
+    flights = [(law, seed, number) for law in laws for seed in seeds for number in range(len(EFFECTS) + 1)]
     with ProcessPoolExecutor(a.jobs) as pool:
-        flown = dict(zip(flights, pool.map(partial(fly, configs), flights, chunksize=4), strict=True))
+        errors = np.array(list(pool.map(partial(fly, loaded, ideal), flights, chunksize=4)))
+    flown = dict(zip(laws, errors.reshape(len(laws), len(seeds), -1), strict=True))
     command = f"python -m benchmarks.effects --laws {a.laws} --laboratories {a.laboratories}"
-    text = table(flown, laws, effects) + f"\nFlown by `{command}` at {versions().get('git', 'unknown')[:10]}.\n"
+    text = table(flown, seeds) + f"\nFlown by `{command}` at commit {versions().get('git', 'unknown')[:10]}.\n"
     if a.table is None:
         print(text, end="")
     else:
         a.table.write_text(text, encoding="utf-8")
     if a.picture is not None:
-        draw(flown, laws, [*EFFECTS, ALL], a.picture)
+        draw(flown, seeds, a.picture)
     return 0
 
 
