@@ -57,7 +57,7 @@ def _shared(config: FlightConfig) -> list[dict[str, Any]]:
     """Return the settings of the phases from the first `grip` on, without what each member has of its own."""
     phases = phases_of(config.mission)
     first = next(number for number, phase in enumerate(phases) if isinstance(phase, GripHandle))
-    return [phase.model_dump(exclude={"end", "arm_deg"}) for phase in phases[first:]]
+    return [phase.model_dump(exclude={"end", "arm_deg", "compliance"}) for phase in phases[first:]]
 
 
 def _carry_begins_s(config: FlightConfig, plan: Plan) -> float:
