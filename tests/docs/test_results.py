@@ -101,12 +101,14 @@ def compared(world: str = "lab", first_seed: int = 1) -> dict[str, Any]:
     return {"rows": rows, "settings": {"world": world, "command": command}, "versions": {"git": 40 * "a"}}
 
 
-def test_the_baselines_have_a_table_of_their_own() -> None:
+def test_baselines_and_soft_laws_have_tables_of_their_own() -> None:
     results = compared()
-    results["rows"] += [compare_row({**FLIGHT, "controller": "pid", "preset": "tuned", "seed": 1}, 0.3)]
+    for law, preset in (("pid", "tuned"), ("examples/compare/psc_soft.yaml", "soft")):
+        results["rows"] += [compare_row({**FLIGHT, "controller": law, "preset": preset, "seed": 1}, 0.3)]
     made = compare_doc.tables([results])
     assert "| pid/tuned |" in made["baselines"]
-    assert "pid" not in made["published"]
+    assert "| psc_soft/soft |" in made["soft"]
+    assert "pid" not in made["published"] and "soft" not in made["baselines"]
 
 
 def test_the_page_says_how_the_laboratory_differs_from_the_paper() -> None:

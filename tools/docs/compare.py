@@ -35,7 +35,7 @@ Results = dict[str, Any]
 """Content of a compare.json."""
 LAWS = ("adaptive", "csc", "psc")
 """The companion's own laws of the comparison; others are baselines."""
-AS_PUBLISHED = ("paper", "paper_slow_leakage", "tuned", "soft")
+AS_PUBLISHED = ("paper", "paper_slow_leakage", "tuned")
 """Presets that contain only what the law's paper describes; all others have additional compensation."""
 IN_PAPER = {"adaptive/paper": "proposed", "psc/tuned": "PSC", "csc/tuned": "CSC"}
 """Variants with figures in the paper, by the paper's name of the law."""
@@ -81,7 +81,7 @@ def laws_markdown(groups: Sequence[Group], differences: Mapping[int, Pairs] | No
     """Return one line per payload and preset, with the figures of the paper and `differences` where available."""
     head = ["payload", "law/preset", "with the payload", *(title for title, _, _ in _FIGURES), "e_q, deg"]
     rows = [
-        [f"{group.payload_kg:g} kg", group.label, _completed(group), *_spreads(group, _FIGURES), _attitude(group)]
+        [f"{group.payload_kg:g} kg", _label(group), _completed(group), *_spreads(group, _FIGURES), _attitude(group)]
         for group in groups
     ]
     if differences:
@@ -197,6 +197,11 @@ def _estimated(c: LawConfig) -> str:
     return ", ".join(found) or "–"
 
 
+def _label(group: Group) -> str:
+    """Return `law/preset`, where a controller file takes its name."""
+    return f"{Path(group.controller).stem}/{group.preset}"
+
+
 def _with_source(table: str, groups: Sequence[Group]) -> str:
     """Return the table followed by the seeds, commands and commits of its flights."""
     rows = [row for group in groups for row in group.rows]
@@ -264,7 +269,9 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
     built_in = [group for group in first if group.controller in LAWS]
     published = [group for group in built_in if group.preset in AS_PUBLISHED]
     extras = [group for group in built_in if group.preset not in AS_PUBLISHED]
-    baselines = [group for group in first if group.controller not in LAWS]
+    others = [group for group in first if group.controller not in LAWS]
+    soft = [group for group in others if group.preset == "soft"]
+    baselines = [group for group in others if group.preset != "soft"]
     errors_of = Counter((group.label, group.payload_kg) for group in whole)
     by_error = [group for group in whole if errors_of[group.label, group.payload_kg] > 1]
     off = {
@@ -283,6 +290,7 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
         "published": (against, published),
         "extras": (against, extras),
         "baselines": (against, baselines),
+        "soft": (laws_markdown, soft),
         "model error": (model_error_markdown, by_error),
         "adaptation": (adaptation_markdown, paired),
         "ablation": (ablation_markdown, ablated),
