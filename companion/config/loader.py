@@ -62,6 +62,10 @@ class FlightConfig(Model):
     vehicle: Vehicle
     controller: AnyControllerConfig
     sources: Sources
+    agreed: str | None = None
+    """Digest of what the computers of both members of a team must have alike (`companion.phases.carry.pair.agreement`); None for a
+    vehicle that flies alone.
+    """
 
 
 def load_flight(

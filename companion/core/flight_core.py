@@ -163,7 +163,9 @@ class FlightCore:
             ball=state.expected.ball,
             chase=state.expected.chase,
             clamp=state.clamp,
-            team=None if self._vehicle.devices.team is None else team_state_of(state, i),
+            team=None
+            if self._vehicle.devices.team is None
+            else team_state_of(state, i, self._parameters.config.agreed),
             carry=state.expected.carry,
         )
 

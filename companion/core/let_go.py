@@ -79,8 +79,8 @@ def _clamp_height_m(t: Transition) -> float | None:
     )
 
 
-def team_state_of(state: FlightState, i: Inputs) -> TeamState:
-    """Return what this vehicle announces to the other."""
+def team_state_of(state: FlightState, i: Inputs, agreed: str | None) -> TeamState:
+    """Return what this vehicle announces to the other; `agreed` is that of `FlightConfig`."""
     action, vehicle = state.supervisor.action, i.vehicle
     return TeamState(
         grip=state.grip,
@@ -90,4 +90,6 @@ def team_state_of(state: FlightState, i: Inputs) -> TeamState:
         px4_lands=state.stage is Stage.AUTOPILOT_LAND,
         position_world_m=_NOWHERE if vehicle is None else vehicle.position_world_m,
         server_s=None if i.mocap is None else i.mocap.exposure_server_s,
+        system_id=None if i.status is None else i.status.system_id,
+        agreed=agreed,
     )

@@ -36,6 +36,7 @@ from companion.safety.mocap import unfused
 from companion.safety.notices import EventDefinition
 from companion.safety.px4 import DISARMED_ABOVE_M
 from companion.safety.rules import CRASHED
+from companion.safety.team import strangers
 from companion.safety.touchdown import MOCAP_FRESH_S
 
 ARMED_SHOWN_S = 1.5
@@ -102,7 +103,7 @@ def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
             _refuse(t, notices.ESTIMATE_UNSTEADY, wanders)
         return
     t.tare.append(Tare.FINISH)
-    problems = _misplaced(t)
+    problems = _start_problems(t)
     if not problems:
         _is_ready(t)
     elif was_ready:  # the vehicle was moved, and may be put back
@@ -135,7 +136,7 @@ def _ready(t: Transition, _: float) -> AutopilotRequest:
             _begin_tare(t)
         if t.start_asked or i.t_s - waiting.looked_s >= seq.LOOK_AGAIN_S:
             t.change_waiting(looked_s=i.t_s)
-            problem = t.state.waiting.settled.problem(i.t_s) or next(iter(_misplaced(t)), None)
+            problem = t.state.waiting.settled.problem(i.t_s) or next(iter(_start_problems(t)), None)
     else:
         t.change_waiting(settled=SettledEstimate())
     if problem is not None:
@@ -161,8 +162,14 @@ def _weigh(t: Transition) -> None:
     t.change_waiting(settled=t.state.waiting.settled.take(i.t_s, i.vehicle, i.mocap))
 
 
+def _start_problems(t: Transition) -> list[str]:
+    """Return how the vehicle's pose differs from the mission's start, and why the other vehicle of its team cannot fly with it; an
+    empty list if there is nothing, or nothing is known.
+    """
+    return _misplaced(t) + strangers(t.i, t.parameters.config.agreed)
+
+
 def _misplaced(t: Transition) -> list[str]:
-    """Return how the vehicle's pose differs from the mission's start, or an empty list if it does not or is unknown."""
     vehicle, p = t.i.vehicle, t.parameters
     if vehicle is None or (p.vehicle.arm.joints and t.i.arm is None):
         return []
@@ -393,7 +400,8 @@ def missing_inputs(i: Inputs, vehicle: Vehicle) -> list[str]:
     if vehicle.jaws is not None:
         devices["clamp"] = i.clamp
     if vehicle.devices.team is not None:
-        devices["other vehicle"] = i.partner
+        partner, timeout_s = i.partner, vehicle.safety.partner_timeout_s
+        devices["other vehicle"] = None if partner is None or i.t_s - partner.stamp_s > timeout_s else partner
     return [name for name, value in devices.items() if value is None]
 
 

@@ -76,6 +76,10 @@ class TeamState(Record, frozen=True, kw_only=True):
     """Position of the body's origin, world frame."""
     server_s: float | None = None
     """When it was said, on the clock of the motion-capture server, which both share: exposure of the newest frame; None if unknown."""
+    system_id: int | None = None
+    """MAVLink system id of its PX4 (MAV_SYS_ID); None if it is unknown, and in older logs."""
+    agreed: str | None = None
+    """`FlightConfig.agreed` of the member; None from its guardian, and in older logs."""
 
 
 class PartnerState(Record, frozen=True, kw_only=True):

@@ -182,6 +182,8 @@ class AutopilotStatus(Record, frozen=True, kw_only=True):
     """Arrival of the newest BATTERY_STATUS of the battery silent for longest; None if none has arrived, and in older logs."""
     system_status: int | None = None
     """HEARTBEAT.system_status (MAV_STATE); None in older logs."""
+    system_id: int | None = None
+    """MAVLink system id of PX4 (MAV_SYS_ID); None in older logs."""
     radio: bool | None = None
     """Whether PX4 receives a pilot's radio or joystick (SYS_STATUS); None if unknown, as in the fast loop and in older logs."""
 

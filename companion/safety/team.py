@@ -68,6 +68,33 @@ class TeamTracker:
                 self.bar_tilt_deg = math.degrees(math.asin(max(-1.0, min(1.0, abs(up)))))
 
 
+def strangers(i: Inputs, agreed: str | None) -> list[str]:
+    """Return why this vehicle and the other cannot take off together, from what the other announces; an empty list if they can.
+
+    Args:
+        agreed: `FlightConfig.agreed` of this vehicle.
+    """
+    if i.partner is None:
+        return []
+    said, found = i.partner.said, list[str]()
+    if said.agreed != agreed:
+        found.append(
+            "the other vehicle flies another mission, from other places or by another version of companion: copy the team's files to "
+            "both computers, and give both the same options"
+        )
+    if said.system_id is not None and i.status is not None and said.system_id == i.status.system_id:
+        found.append(
+            f"PX4 of the other vehicle has MAV_SYS_ID {said.system_id}, too: set it to another number in one of the two, and restart it"
+        )
+    own_s = None if i.mocap is None else i.mocap.exposure_server_s
+    if own_s is not None and said.server_s is not None and abs(own_s - said.server_s) > CLOCKS_APART_S:
+        found.append(
+            f"motion capture's clock shows {own_s:.1f} s here and {said.server_s:.1f} s at the other vehicle (limit "
+            f"{CLOCKS_APART_S:g} s apart): let both receive the frames of one server (devices.mocap.server)"
+        )
+    return found
+
+
 def _both_hold(t: TeamTracker) -> bool:
     """Return whether both hold the bar, as far as is known."""
     return t.grip in HELD and (t.said is None or t.said.grip in HELD)
@@ -135,5 +162,7 @@ BAR_TILT_MAX_DEG: Final = 10.0
 """Largest tilt of a bar that is carried: 0.2 m between the ends of the shipped one. A lift in a drawn laboratory tilts it by 4 deg."""
 BAR_UNSEEN_S: Final = 0.5
 """Time after which a bar that motion capture does not see is reported; bodies are hidden for moments."""
+CLOCKS_APART_S: Final = 1.0
+"""Largest difference between the newest frames of both vehicles before take-off; those of one server are 20 ms apart."""
 ROTORS_APART_M: Final = 0.05
 """Least distance of the rotor circles in flight."""

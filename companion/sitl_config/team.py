@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from companion.config.document import ConfigError, Document
@@ -15,7 +15,7 @@ from companion.config.shipped import named_file
 from companion.config.team import Member, Team
 from companion.config.yaml_strict import read_document
 from companion.phases.carry.bar import End
-from companion.phases.carry.pair import pair_problems
+from companion.phases.carry.pair import agreement, pair_problems
 from companion.sitl_config.loader import SitlConfig, load_sitl
 
 TEAM_WORLD = "pair"
@@ -81,6 +81,10 @@ def load_team(
         if end == "right" and configs:
             origin = document.origin(("members", end))
             own.append(override_of("world.seed", configs["left"].world.seed + SEED_APART, origin))
+        if not real_px4:  # which has one by the number of its instance
+            own.insert(
+                0, override_of("world.px4_params.MAV_SYS_ID", ENDS.index(end) + 1, document.origin(("members", end)))
+            )
         try:
             configs[end] = load_sitl(
                 mission,
@@ -99,7 +103,9 @@ def load_team(
     found = TeamConfig(team.name, document.source, configs["left"], configs["right"])
     if lines := [f"{document.source}: {text}" for text in pair_problems(found.left, found.right)]:
         raise ConfigError(lines)
-    return found
+    agreed = {"agreed": agreement(found.left, found.right)}
+    left, right = (config.model_copy(update=agreed) for _, config in found.members)
+    return replace(found, left=left, right=right)
 
 
 def _of_member(end: End, overrides: Sequence[str]) -> list[str]:

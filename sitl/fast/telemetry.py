@@ -146,6 +146,7 @@ class FastTelemetry:
             battery_remaining=remaining,
             battery_stamp_s=battery_stamp_s,
             system_status=system_status,
+            system_id=self._px4.params.integer("MAV_SYS_ID"),
         )
 
     def estimator(self, t_s: float) -> EstimatorReport | None:

@@ -54,6 +54,13 @@ def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
         (["left.vehicle.safety.land_speed_m_s=0.2"], "safety.land_speed_m_s differs between the members"),
         (["left.vehicle.devices.mocap.bar_id=4"], "devices.mocap.bar_id differs between the members"),
         (["left.vehicle.devices.mocap.server=192.168.1.11"], "devices.mocap.server differs between the members"),
+        (["left.vehicle.devices.mocap.command_port=1512"], "devices.mocap.command_port differs between the members"),
+        (["left.vehicle.devices.mocap.type=vicon"], "devices.mocap.type differs between the members"),
+        (["vehicle.devices.mocap.type=external"], "devices.mocap.type is external, but the members share the clock"),
+        (
+            ["left.vehicle.devices.team.partner_port=14800"],
+            "left sends to port 14800 (devices.team.partner_port), but right receives at 14701 (devices.team.port)",
+        ),
         (
             ["left.vehicle.tether.anchor_world_m=[0.0,-1.9,0.0]", "right.vehicle.tether.anchor_world_m=[0.0,1.9,0.0]"],
             "the tethers come as near as 0.",
@@ -81,6 +88,10 @@ def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
         "landing speeds",
         "bodies of the bar",
         "servers",
+        "two programs of one server",
+        "two systems",
+        "no frames",
+        "another port",
         "tethers",
         "short bar",
         "one start",
@@ -91,6 +102,36 @@ def test_members_that_do_not_go_together_are_refused_in_one_line(overrides: list
     (line,) = problems(*overrides)
     assert line.startswith(f"{CARRY}: ")
     assert said in line
+
+
+def test_computers_with_other_files_have_another_agreement() -> None:
+    """It covers what the check of the two together has read, and nothing that belongs to one computer."""
+    agreed = load_team("carry").left.agreed
+    assert agreed is not None
+    same = (
+        "vehicle.devices.mocap.interface=10.0.0.2",
+        "mission.start.takeoff=by_operator",
+        "vehicle.devices.team.key_file=k",
+    )
+    team = load_team("carry", same)
+    assert team.left.agreed == team.right.agreed == agreed
+    for other in (
+        "mission.phases[2].lift_m=0.3",
+        "mission.phases[2].compliance.mass_kg=5",
+        "mission.limits.speed_max_m_s=0.5",
+        "right.mission.start.position_m=[-1.0, -1.4]",
+        "left.vehicle.tether.anchor_world_m=[0.1, 1.9, 0.0]",
+        "vehicle.devices.mocap.server=192.168.1.12",
+        "left.vehicle.devices.mocap.rigid_body_id=5",
+        "vehicle.devices.mocap.bar_id=4",
+    ):
+        assert load_team("carry", [other]).left.agreed not in (None, agreed), other
+
+
+def test_the_stubs_of_a_team_have_system_ids_of_their_own() -> None:
+    teams = [load_team("carry", real_px4=real) for real in (False, True)]
+    found = [[config.world.px4_params.get("MAV_SYS_ID") for _, config in team.members] for team in teams]
+    assert found == [[1.0, 2.0], [None, None]], "a real PX4 has that of its instance"
 
 
 def test_what_a_member_flies_before_grip_and_how_its_arm_holds_the_bar_are_its_own() -> None:

@@ -201,6 +201,7 @@ def test_a_hold_and_an_aborted_flight_that_lands_are_announced(
     aborting: bool, action: SafetyAction, announced: tuple[bool, bool]
 ) -> None:
     held = state(aborting=aborting, supervisor=SupervisorState(action, "cause", T_S))
-    found = team_state_of(held, inputs(1.3, None))
+    found = team_state_of(held, inputs(1.3, None), "files")
     assert (found.holds, found.lands, found.position_world_m) == (*announced, (0.0, 0.0, 1.3))
-    assert team_state_of(held, replace(inputs(1.3, None), vehicle=None, mocap=None)).server_s is None
+    assert found.agreed == "files"
+    assert team_state_of(held, replace(inputs(1.3, None), vehicle=None, mocap=None), None).server_s is None

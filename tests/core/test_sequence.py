@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from companion.config.devices import TeamDevice
 from companion.core.flight_state import FlightState, Tare
 from companion.core.sequence import missing_inputs
 from companion.mission.active_plan import ActiveTrajectory
@@ -31,7 +32,7 @@ from companion.safety.rotor_stop import RotorStop
 from companion.safety.touchdown import Sinking
 from tests.core.test_reactions import CONFIG, P, after, ids, in_plan, tick
 from tests.safety.faults import EXTERNAL
-from tests.safety.healthy import fed_by_another, healthy, put
+from tests.safety.healthy import fed_by_another, healthy, put, with_partner
 
 replace = msgspec.structs.replace
 NOW_S = healthy().t_s
@@ -222,6 +223,16 @@ def test_every_device_that_sent_nothing_is_named() -> None:
     external = ["PX4 state", "PX4", "PX4's ESTIMATOR_STATUS", "arm", "force sensor"]
     assert missing_inputs(nothing, EXTERNAL) == external
     assert missing_inputs(fed_by_another(healthy()), EXTERNAL) == []
+
+
+def test_the_other_vehicle_of_a_team_must_be_heard_now() -> None:
+    i, devices = with_partner(healthy()), CONFIG.vehicle.devices
+    vehicle = CONFIG.vehicle.model_copy(update={"devices": devices.model_copy(update={"team": TeamDevice()})})
+    assert i.partner is not None
+    for age_s, missing in ((0.0, []), (0.29, []), (0.31, ["other vehicle"])):
+        heard = replace(i, partner=replace(i.partner, stamp_s=i.t_s - age_s))
+        assert missing_inputs(heard, vehicle) == missing
+    assert missing_inputs(replace(i, partner=None), vehicle) == ["other vehicle"]
 
 
 @pytest.mark.parametrize(("elapsed_s", "refused"), [(14.9, False), (15.1, True)])

@@ -227,6 +227,12 @@ async def test_the_heartbeat_of_an_armed_px4_is_requested_so_that_a_kill_is_seen
         await eventually(lambda: autopilot.vehicle() is not None and is_killed(autopilot.status()), "the kill")
 
 
+async def test_the_status_names_the_system_id_of_px4() -> None:
+    async with linked() as (_, autopilot):
+        await eventually(lambda: autopilot.status() is not None, "a heartbeat")
+        assert read(autopilot).system_id == 1
+
+
 async def test_heartbeat_loss_shows_as_an_old_stamp() -> None:
     port = free_udp_port()
     clock = flight_clock()

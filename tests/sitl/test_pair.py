@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from companion.model.outputs import Outputs
 from companion.model.team import Grip, TeamState
-from companion.model.types import OperatorCommand, Outcome, SafetyAction
+from companion.model.types import AutopilotRequest, OperatorCommand, Outcome, SafetyAction
 from companion.model.verdict import Answer
 from companion.sitl_config.team import load_team
 from sitl.fast.result import FastResult
@@ -123,6 +123,32 @@ def test_members_that_are_far_apart_in_their_plans_do_not_continue_but_set_the_b
     assert "hold_expired" in ids(result.members[0])
     assert "partner_lands" in ids(result.members[1])
     assert_both_have_let_go(team, result, 0.03)
+
+
+@pytest.mark.parametrize(
+    ("changed", "text"),
+    [
+        ({"agreed": "of other files"}, "the other vehicle flies another mission"),
+        ({"system_id": 1}, "PX4 of the other vehicle has MAV_SYS_ID 1, too"),
+        ({"server_s": 1000.0}, "motion capture's clock shows"),
+    ],
+    ids=["another version of the mission", "the same system id", "another server"],
+)
+def test_with_a_member_that_does_not_go_with_it_a_vehicle_arms_nothing(changed: dict[str, object], text: str) -> None:
+    team = team_of()
+    right = team.flights[1]
+    announced = right.announced
+
+    def other(outputs: Outputs | None) -> TeamState | None:
+        said = announced(outputs)
+        return None if said is None else replace(said, **changed)
+
+    right.announced = other  # type: ignore[method-assign]
+    left = team.run(15.0).members[0]
+    (refused,) = [event.text for outputs in left.outputs for event in outputs.events if event.id == "start_refused"]
+    assert text in refused
+    assert left.outputs[-1].outcome is Outcome.REFUSED
+    assert not any(outputs.request is AutopilotRequest.ARM for outputs in left.outputs)
 
 
 @functools.cache

@@ -36,6 +36,8 @@ class Inbox:
         self._attitude: tuple[float, Quat, Vec3, float | None] | None = None
         self._imu: tuple[float, Vec3, float | None, Vec3, int] | None = None
         self._delta_velocity_frd = DeltaVelocity()
+        self.system_id: int | None = None
+        """MAVLink system id of PX4; None before it is known."""
         self._heartbeat: tuple[float, bool, FlightMode, int] | None = None
         self._estimator: EstimatorReport | None = None
         self._positions = self._attitudes = self._imus = 0
@@ -131,6 +133,7 @@ class Inbox:
             battery_remaining=remaining,
             battery_stamp_s=battery_stamp_s,
             system_status=system_status,
+            system_id=self.system_id,
             radio=self._radio,
         )
 

@@ -74,7 +74,7 @@ class Traffic:
 
     def only_from(self, system_id: int) -> None:
         """Read the state from this MAVLink system, which is PX4."""
-        self._system_id = system_id
+        self._system_id = self._inbox.system_id = system_id
         if isinstance(self._wire, UdpWire):
             self._wire.system = system_id
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Iterator
 from typing import Any, Final
 
+from companion import __version__
 from companion.config.loader import FlightConfig
 from companion.config.vehicle import Vehicle
 from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
 from companion.model.types import Reference, Vec3
+from companion.phases.carry.bar import End
 from companion.phases.carry.carry import Carry
 from companion.phases.carry.grip import APART_M, GripHandle
 
@@ -47,10 +51,36 @@ def pair_problems(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
         yield "safety.land_speed_m_s differs between the members; an event lands both with the bar, whose ends must descend alike"
     if left.vehicle.devices.mocap.bar_id != right.vehicle.devices.mocap.bar_id:
         yield "devices.mocap.bar_id differs between the members; both carry one bar"
-    one_server = left.vehicle.devices.mocap.server == right.vehicle.devices.mocap.server
-    if not one_server:
-        yield "devices.mocap.server differs between the members; both must receive the frames of one server, whose clock they share"
+    for key in ("type", "server", "command_port"):
+        if getattr(left.vehicle.devices.mocap, key) != getattr(right.vehicle.devices.mocap, key):
+            yield f"devices.mocap.{key} differs between the members; both must receive the frames of one server, whose clock they share"
+    if left.vehicle.devices.mocap.external:
+        yield "devices.mocap.type is external, but the members share the clock of the frames: let both receive them (natnet)"
+    if _port(left) != _port(right):
+        yield from _unheard("left", left, "right", right)
+        yield from _unheard("right", right, "left", left)
     yield from _near(left, right)
+
+
+def agreement(left: FlightConfig, right: FlightConfig) -> str:
+    """Return a digest of all that these checks have read, and of the version that plans: both computers must have it alike."""
+    read = [
+        {
+            "mission": config.mission.model_dump(
+                mode="json", include={"limits": True, "phases": True, "repeat": True, "start": _START}
+            ),
+            "safety": config.vehicle.safety.land_speed_m_s,
+            "radius": config.vehicle.airframe.radius_m,
+            "tether": None if config.vehicle.tether is None else config.vehicle.tether.anchor_world_m,
+            "mocap": config.vehicle.devices.mocap.model_dump(mode="json", include=_MOCAP),
+        }
+        for config in (left, right)
+    ]
+    return hashlib.sha256(json.dumps([__version__, read], sort_keys=True).encode()).hexdigest()[:16]
+
+
+_START: Final = {"position_m", "yaw_deg", "arm_deg"}
+_MOCAP: Final = {"type", "server", "command_port", "rigid_body_id", "bar_id"}
 
 
 def _shared(config: FlightConfig) -> list[dict[str, Any]]:
@@ -72,6 +102,16 @@ def _body(config: FlightConfig) -> int:
 def _port(config: FlightConfig) -> int | None:
     team = config.vehicle.devices.team
     return None if team is None else team.port
+
+
+def _unheard(end: End, config: FlightConfig, other: End, partner: FlightConfig) -> Iterator[str]:
+    """Yield why what this member sends does not reach the other."""
+    link, port = config.vehicle.devices.team, _port(partner)
+    if link is not None and link.partner_port != port:
+        yield (
+            f"{end} sends to port {link.partner_port} (devices.team.partner_port), but {other} receives at {port} (devices.team.port); "
+            "make them equal"
+        )
 
 
 def _near(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
