@@ -182,8 +182,8 @@ def _fly(arguments: argparse.Namespace) -> int:
     config = _load(arguments, hardware=arguments.sitl is None, real_px4=arguments.sitl == "px4")
     problems = _no_server(config) or [
         *check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases),
-        *_start_impossible(config),
-        *_no_bus_time(config, speed),
+        *start_impossible(config),
+        *no_bus_time(config, speed),
     ]
     if problems:
         for line in problems:
@@ -224,7 +224,8 @@ def speed_of(arguments: argparse.Namespace) -> float | None:
     return 0.0
 
 
-def _no_bus_time(config: SitlConfig, speed: float | None) -> list[str]:
+def no_bus_time(config: SitlConfig, speed: float | None) -> list[str]:
+    """Return one line on why the world's faults have no effect in simulated time; an empty list if they have."""
     if speed is None or all(fault.kind != "bus_delay" for fault in config.world.faults):
         return []
     return ["world.faults: bus_delay: the servo bus takes no time in simulated time; add --real-time"]
@@ -248,7 +249,7 @@ def _no_server(config: FlightConfig) -> list[str]:
     return []
 
 
-def _start_impossible(config: FlightConfig) -> list[str]:
+def start_impossible(config: FlightConfig) -> list[str]:
     """Return one line on why a flight with `--wait-for-start` could never be started; an empty list if it could."""
     if config.mission.start.takeoff != "by_operator":
         return []

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from companion.cli.flight import speed_of
+from companion.cli.flight import no_bus_time, speed_of, start_impossible
 from companion.cli.options import add_law, add_seed, time_stamp
 from companion.config.document import ConfigError
 from companion.config.shipped import names
@@ -96,7 +96,17 @@ def _fly(arguments: argparse.Namespace) -> int:
     speed = speed_of(arguments)
     if speed is not None and not speed > 0.0:
         return EXIT_BAD_INPUT
+    if arguments.out is not None and not arguments.out.strip():
+        print_error("companion team fly: --out: expected the name of a folder, got an empty one")
+        return EXIT_BAD_INPUT
     team = _loaded(arguments)
+    problems = [
+        f"{end}: {line}"
+        for end, config in team.members
+        for line in start_impossible(config) + no_bus_time(config, speed)
+    ]
+    if problems:
+        raise ConfigError(problems)
     out = Path(arguments.out) if arguments.out else Path("flights") / f"{time_stamp()}-{team.name}"
     problem = why_unusable(out, "summary.json")
     if problem is not None:

@@ -66,6 +66,17 @@ FLY = ("team", "fly", TEAM, "--sitl", "--world", "ideal", "--speed", "max", "--o
             "team carrry: expected carry or a file, found neither (did you mean carry?)",
         ),
         (("team", "fly", TEAM, "--sitl", "--speed", "0", "--out", "out"), "--speed 0: expected a number above 0"),
+        ((*FLY, "--real-time"), "--speed max: expected not together with --real-time"),
+        (("team", "fly", TEAM, "--real-time"), "expected --sitl; on hardware each vehicle flies its part"),
+        (("team", "fly", TEAM, "--sitl", "--out", " "), "--out: expected the name of a folder, got an empty one"),
+        (
+            (*FLY, "--set", "right.world.faults=[{kind: bus_delay, t_s: 1.0}]"),
+            "right: world.faults: bus_delay: the servo bus takes no time in simulated time; add --real-time",
+        ),
+        (
+            (*FLY, "--set", "left.mission.start.takeoff=by_operator"),
+            "left: mission.start.takeoff is by_operator (--wait-for-start), but start could not be commanded",
+        ),
         (
             ("fly", "carry", "--sitl", "--out", "out"),
             "this vehicle flies alone: fly a team file with `companion team fly`",
@@ -91,7 +102,23 @@ FLY = ("team", "fly", TEAM, "--sitl", "--world", "ideal", "--speed", "max", "--o
             "devices.team.key_file: missing; expected the file of the key",
         ),
     ],
-    ids=["one body", "hardware", "px4 as a word", "px4", "misspelt", "speed", "alone", "member", "partner", "key"],
+    ids=[
+        "one body",
+        "hardware",
+        "px4 as a word",
+        "px4",
+        "misspelt",
+        "speed",
+        "real time",
+        "real time on hardware",
+        "empty folder",
+        "bus",
+        "start",
+        "alone",
+        "member",
+        "partner",
+        "key",
+    ],
 )
 def test_bad_input_is_one_line_and_nothing_is_started(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[object, ...], said: str
@@ -220,6 +247,16 @@ def test_a_member_that_is_refused_keeps_the_other_on_the_ground(sandbox: Sandbox
     members = summary_in(sandbox.cwd / "out")["members"]
     assert (members["left"]["outcome"], members["right"]["outcome"]) == ("aborted", "refused")
     assert not {"armed", "takeoff"} & {event["id"] for event in members["left"]["events"]}
+
+
+def test_members_with_one_system_id_are_refused(sandbox: Sandbox) -> None:
+    ended = sandbox.run(*FLY, "--no-report", "--set", "right.world.px4_params.MAV_SYS_ID=1")
+    sandbox.assert_nobody_left()
+    assert ended.code == EXIT_REFUSED
+    text = "PX4 of the other vehicle has MAV_SYS_ID 1, too: set it to another number in one of the two, and restart it"
+    assert ended.err_lines == [f"{end}: {text}" for end in ENDS]
+    for member in summary_in(sandbox.cwd / "out")["members"].values():
+        assert member["outcome"] == "refused" and "armed" not in {event["id"] for event in member["events"]}
 
 
 def test_without_its_world_a_team_is_lost_and_nothing_is_left(sandbox: Sandbox) -> None:
