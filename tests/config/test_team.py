@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from companion.config.document import ConfigError
 from companion.mission.check import check_mission
+from companion.model.algebra import minus, plus, scaled
+from companion.model.types import Vec3
+from companion.phases.carry.pair import segments_apart_m
 from companion.sitl_config.team import SEED_APART, TeamConfig, load_team
 
 CARRY = Path("configs/teams/carry.yaml")
@@ -18,6 +24,21 @@ def problems(*overrides: str) -> list[str]:
     with pytest.raises(ConfigError) as refused:
         load_team(CARRY, overrides)
     return list(refused.value.lines)
+
+
+NEAR = "mission.phases[2].waypoints=[{position_m: [-0.9, 0.0]}]"
+FROM_FAR = "left.mission.start.position_m=[2.0, 1.0]", "left.vehicle.tether.anchor_world_m=[-2.0, 1.9, 0.0]"
+
+
+def phases(before: str = "", after: str = "", arm: str = "carry") -> list[str]:
+    """Options with which both members fly more: the left one before it grips with the arm pose `arm`, and both after the release."""
+    bar = "{length_m: 1.2, handle_height_m: 0.2, mass_max_kg: 0.5, position_m: [-1.0, 0.0], yaw_deg: 90}"
+    takeoff, land = "{type: takeoff, height_m: 1.0, duration_s: 3.0}", "{type: land, speed_m_s: 0.35}"
+    rest = "{type: carry, lift_m: 0.4, waypoints: [{position_m: [1.0, 0.0]}]}, {type: release, arm_deg: folded}"
+    return [
+        f"{end}.mission.phases=[{takeoff}{more}, {{type: grip, bar: {bar}, arm_deg: {pose}, end: {end}}}, {rest}{after}, {land}]"
+        for end, more, pose in (("left", before, arm), ("right", "", "carry"))
+    ]
 
 
 def test_the_shipped_team_has_two_members_that_differ_where_they_must() -> None:
@@ -65,10 +86,30 @@ def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
             ["left.vehicle.tether.anchor_world_m=[0.0,-1.9,0.0]", "right.vehicle.tether.anchor_world_m=[0.0,1.9,0.0]"],
             "the tethers come as near as 0.",
         ),
-        (["mission.phases[1].bar.length_m=0.6"], "the vehicles come as near as "),
+        (["mission.phases[1].bar.length_m=0.6"], "the vehicles come as near as 1.05 m "),
+        (["left.mission.repeat=2"], "both members must fly the same phases from grip on, as often"),
+        (
+            [NEAR, *FROM_FAR, "right.vehicle.tether.anchor_world_m=[1.0, 1.6, 0.0]"],
+            "the tethers come as near as 0.09 m on the ways to the bar (minimum 0.3 m)",
+        ),
+        (
+            ["left.vehicle.tether=null", "right.vehicle.tether.anchor_world_m=[1.4, 1.2, 0.6]"],
+            "one's tether and the other's rotors come as near as 0.00 m 10.5 s after the lift (minimum 0.3 m)",
+        ),
+        (
+            [
+                *(NEAR, "left.vehicle.tether=null", "left.mission.start.position_m=[1.0, 1.6]"),
+                "right.vehicle.tether.anchor_world_m=[1.0, 1.6, 0.0]",
+            ],
+            "one's tether and the other's rotors come as near as 0.00 m on the ways to the bar",
+        ),
+        (
+            ["vehicle.tether=null", *phases(after=", {type: line, to_m: [1.0, 0.0, 1.0]}")],
+            "the vehicles come as near as 0.00 m on the ways from the bar",
+        ),
         (
             ["vehicle.tether=null", "left.mission.start.position_m=[-1.0, -1.45]"],
-            "the ways of the vehicles to the bar come as near as 0.00 m",
+            "the vehicles come as near as 0.00 m on the ways to the bar",
         ),
         (
             [
@@ -76,7 +117,7 @@ def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
                 *("left.mission.start.position_m=[-1.0, -1.45]", "left.mission.start.yaw_deg=90"),
                 *("right.mission.start.position_m=[-1.0, 1.45]", "right.mission.start.yaw_deg=-90"),
             ],
-            "the ways of the vehicles to the bar come as near as 0.00 m",
+            "the vehicles come as near as 0.00 m on the ways to the bar",
         ),
     ],
     ids=[
@@ -94,6 +135,11 @@ def test_an_option_with_a_members_name_in_front_is_for_that_member() -> None:
         "another port",
         "tethers",
         "short bar",
+        "repetitions",
+        "tethers on the way",
+        "tether and rotors",
+        "tether and rotors on the way",
+        "one end",
         "one start",
         "starts swapped",
     ],
@@ -135,14 +181,32 @@ def test_the_stubs_of_a_team_have_system_ids_of_their_own() -> None:
 
 
 def test_what_a_member_flies_before_grip_and_how_its_arm_holds_the_bar_are_its_own() -> None:
-    bar = "{length_m: 1.2, handle_height_m: 0.2, mass_max_kg: 0.5, position_m: [-1.0, 0.0], yaw_deg: 90}"
-    rest = "{type: carry, lift_m: 0.4, waypoints: [{position_m: [1.0, 0.0]}]}, {type: release, arm_deg: folded}"
-    overrides = ["vehicle.tether=null"]
-    for end, before, arm in (("left", "{type: hold, duration_s: 1.0}, ", "[70.0, 25.0]"), ("right", "", "carry")):
-        grip = f"{{type: grip, bar: {bar}, arm_deg: {arm}, end: {end}}}"
-        takeoff = "{type: takeoff, height_m: 1.0, duration_s: 3.0}"
-        overrides.append(f"{end}.mission.phases=[{takeoff}, {before}{grip}, {rest}, {{type: land, speed_m_s: 0.35}}]")
+    overrides = ["vehicle.tether=null", *phases(", {type: hold, duration_s: 1.0}", arm="[70.0, 25.0]")]
     assert [len(config.mission.phases) for _, config in load_team(CARRY, overrides).members] == [6, 5]
+
+
+def test_a_bar_that_is_carried_several_times_is_judged_like_one_that_is_carried_once() -> None:
+    for count in (2, 3):
+        assert load_team(CARRY, [f"mission.repeat={count}"]).left.mission.repeat == count
+
+
+POINT = st.tuples(*3 * [st.floats(-2.0, 2.0)])
+
+
+@given(st.tuples(POINT, POINT), st.tuples(POINT, POINT))
+@example(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), ((0.5, -1.0, 0.0), (0.5, 1.0, 0.0)))
+@example(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), ((0.2, 0.0, 0.5), (0.8, 0.0, 0.5)))
+@example(((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), ((1.0, 1.0, 1.0), (1.0, 1.0, 1.0)))
+def test_the_distance_of_two_tethers_is_the_least_between_any_points_of_them(
+    one: tuple[Vec3, Vec3], other: tuple[Vec3, Vec3]
+) -> None:
+    def along(line: tuple[Vec3, Vec3]) -> list[Vec3]:
+        return [plus(line[0], scaled(minus(line[1], line[0]), n / 40)) for n in range(41)]
+
+    found_m = segments_apart_m(one, other)
+    sampled_m = min(math.dist(a, b) for a in along(one) for b in along(other))
+    assert found_m <= sampled_m + 1e-6
+    assert found_m >= sampled_m - (math.dist(*one) + math.dist(*other)) / 80 - 1e-6
 
 
 @pytest.mark.parametrize(

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Final
 
 from companion import __version__
 from companion.config.loader import FlightConfig
-from companion.config.vehicle import Vehicle
 from companion.mission.phase import phases_of
 from companion.mission.plan import Plan
-from companion.model.types import Reference, Vec3
+from companion.model.algebra import dot, minus, plus, scaled
+from companion.model.types import Vec3
 from companion.phases.carry.bar import End
 from companion.phases.carry.carry import Carry
 from companion.phases.carry.grip import APART_M, GripHandle
 
 STEP_S: Final = 0.05
+PLACES_M: Final = 0.05
+"""Distance of the places of a way that are compared with those of the other vehicle's."""
 ROUNDING_M: Final = 1e-6
 """Difference of two computed distances that are equal."""
 TETHERS_APART_M: Final = 0.3
-"""Least distance between the straight lines of the two tethers."""
+"""Least distance of the straight line of a tether from that of the other vehicle, and from its rotors."""
 
 
 def pair_problems(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
@@ -44,8 +48,8 @@ def pair_problems(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
     ):
         if one == other:
             yield f"both members have {what} {one}; {advice}"
-    if left.mission.limits != right.mission.limits or _shared(left) != _shared(right):
-        yield "both members must fly the same phases from grip on, and with the same limits: they move one bar"
+    if _shared(left) != _shared(right):
+        yield "both members must fly the same phases from grip on, as often, and with the same limits: they move one bar"
         return
     if left.vehicle.safety.land_speed_m_s != right.vehicle.safety.land_speed_m_s:
         yield "safety.land_speed_m_s differs between the members; an event lands both with the bar, whose ends must descend alike"
@@ -83,16 +87,12 @@ _START: Final = {"position_m", "yaw_deg", "arm_deg"}
 _MOCAP: Final = {"type", "server", "command_port", "rigid_body_id", "bar_id"}
 
 
-def _shared(config: FlightConfig) -> list[dict[str, Any]]:
-    """Return the settings of the phases from the first `grip` on, without what each member has of its own."""
+def _shared(config: FlightConfig) -> list[Any]:
+    """Return limits, repetitions and the settings of the phases from the first `grip` on, without what each member has of its own."""
     phases = phases_of(config.mission)
     first = next(number for number, phase in enumerate(phases) if isinstance(phase, GripHandle))
-    return [phase.model_dump(exclude={"end", "arm_deg", "compliance"}) for phase in phases[first:]]
-
-
-def _carry_begins_s(config: FlightConfig, plan: Plan) -> float:
-    index = next(number for number, phase in enumerate(phases_of(config.mission)) if isinstance(phase, Carry))
-    return next(segment.start_s for segment in plan.segments if segment.index == index)
+    own = {"end", "arm_deg", "compliance"}
+    return [config.mission.limits, config.mission.repeat, *(phase.model_dump(exclude=own) for phase in phases[first:])]
 
 
 def _body(config: FlightConfig) -> int:
@@ -115,62 +115,107 @@ def _unheard(end: End, config: FlightConfig, other: End, partner: FlightConfig) 
 
 
 def _near(left: FlightConfig, right: FlightConfig) -> Iterator[str]:
-    """Yield where the vehicles or their tethers come too near to each other."""
+    """Yield where the vehicles or their tethers come too near to each other, one line for each of the two."""
     plans = [Plan.build(config.mission, config.vehicle) for config in (left, right)]
-    least_m = left.vehicle.airframe.radius_m + right.vehicle.airframe.radius_m + APART_M
-    near: tuple[float, float] | None = None
-    crossed: tuple[float, float] | None = None
-    begun = [_carry_begins_s(config, plan) for config, plan in zip((left, right), plans, strict=True)]
-    end_s = max(plan.duration_s - start_s for plan, start_s in zip(plans, begun, strict=True))
-    # Before the bar is lifted each moves at a time of its own, so that no place of one way may be near any of the other.
-    ways = [_way(plan, start_s) for plan, start_s in zip(plans, begun, strict=True)]
-    ways_m = min(math.dist(one, other) for one in ways[0] for other in ways[1])
-    if ways_m < min(least_m, math.dist(ways[0][-1], ways[1][-1]) - ROUNDING_M):
-        yield (
-            f"the ways of the vehicles to the bar come as near as {ways_m:.2f} m (minimum {least_m:.2f} m: two rotor circles and "
-            f"{APART_M:g} m); start each at its own end of the bar (mission.start.position_m)"
+    radii_m = [config.vehicle.airframe.radius_m for config in (left, right)]
+    least_m = sum(radii_m) + APART_M
+    anchors = [
+        None if config.vehicle.tether is None else config.vehicle.tether.anchor_world_m for config in (left, right)
+    ]
+    stretches = [_stretches(config, plan) for config, plan in zip((left, right), plans, strict=True)]
+    held_m = math.dist(*(each[1].places[0][:2] for each in stretches))
+    vehicles, tethers, rotors = _Nearest(), _Nearest(), _Nearest()
+    for one, other in zip(*stretches, strict=True):
+        # With the bar both move at once. On the way to it and from it each moves at a time of its own, so that no place of one may be
+        # near any of the other.
+        pairs = (
+            zip(one.places, other.places, strict=False) if one.together else itertools.product(one.places, other.places)
         )
-    # Then both move at once.
-    for n in range(int(end_s / STEP_S)):
-        at = [plan.reference(start_s + n * STEP_S) for plan, start_s in zip(plans, begun, strict=True)]
-        apart_m = math.dist(at[0].position_world_m[:2], at[1].position_world_m[:2])
-        if apart_m < least_m and (near is None or apart_m < near[1]):
-            near = (n * STEP_S, apart_m)
-        lines_m = _tethers_apart_m(left.vehicle, at[0], right.vehicle, at[1])
-        if lines_m < TETHERS_APART_M and (crossed is None or lines_m < crossed[1]):
-            crossed = (n * STEP_S, lines_m)
-    if near is not None:
+        for n, at in enumerate(pairs):
+            where = f"{n * STEP_S:.1f} s after the lift" if one.together else one.where
+            apart_m = math.dist(at[0][:2], at[1][:2])
+            # The bar keeps them apart by one distance: if that is too short, it is not the ways that are wrong.
+            if one.together or apart_m < held_m - ROUNDING_M:
+                vehicles.take(apart_m, where, one.together)
+            lines = [None if anchor is None else (anchor, place) for anchor, place in zip(anchors, at, strict=True)]
+            if lines[0] is not None and lines[1] is not None:
+                tethers.take(segments_apart_m(lines[0], lines[1]), where, one.together)
+            for line, centre, radius_m in zip(lines, at[::-1], radii_m[::-1], strict=True):
+                if line is not None:
+                    rotors.take(max(0.0, segments_apart_m(line, (centre, centre)) - radius_m), where, one.together)
+    if vehicles.distance_m < least_m:
         yield (
-            f"the vehicles come as near as {near[1]:.2f} m, {near[0]:.1f} s after the lift (minimum {least_m:.2f} m: two rotor circles "
-            f"and {APART_M:g} m); use a longer bar, or change the waypoints"
+            f"the vehicles come as near as {vehicles.distance_m:.2f} m {vehicles.where} (minimum {least_m:.2f} m: two rotor circles "
+            f"and {APART_M:g} m); {'use a longer bar, or change the waypoints' if vehicles.together else _PART}"
         )
-    if crossed is not None:
+    near = tethers if tethers.distance_m < TETHERS_APART_M else rotors
+    if near.distance_m < TETHERS_APART_M:
+        what = "the tethers come" if near is tethers else "one's tether and the other's rotors come"
         yield (
-            f"the tethers come as near as {crossed[1]:.2f} m, {crossed[0]:.1f} s after the lift (minimum {TETHERS_APART_M:g} m): they "
-            "may cross; move the anchors apart, or change the waypoints"
+            f"{what} as near as {near.distance_m:.2f} m {near.where} (minimum {TETHERS_APART_M:g} m): they may cross; move the anchors "
+            f"apart, or {'change the waypoints' if near.together else _PART}"
         )
 
 
-def _way(plan: Plan, end_s: float) -> list[tuple[float, float]]:
-    """Return the horizontal places of the vehicle until a time of its plan."""
-    times_s = [*(n * STEP_S for n in range(math.ceil(end_s / STEP_S))), end_s]
-    return [plan.reference(t_s).position_world_m[:2] for t_s in times_s]
+_PART: Final = "let each start and end at its own end of the bar (mission.start.position_m)"
 
 
-def _tethers_apart_m(left: Vehicle, at_left: Reference, right: Vehicle, at_right: Reference) -> float:
-    """Return the distance between the straight lines from anchor to vehicle; infinite without one of the tethers."""
-    if left.tether is None or right.tether is None:
-        return math.inf
-    return _segments_apart_m(
-        (left.tether.anchor_world_m, at_left.position_world_m), (right.tether.anchor_world_m, at_right.position_world_m)
-    )
+@dataclass
+class _Nearest:
+    """The nearest of many approaches."""
+
+    distance_m: float = math.inf
+    where: str = ""
+    together: bool = False
+
+    def take(self, distance_m: float, where: str, together: bool) -> None:
+        """Keep an approach if it is the nearest so far."""
+        if distance_m < self.distance_m:
+            self.distance_m, self.where, self.together = distance_m, where, together
 
 
-def _segments_apart_m(one: tuple[Vec3, Vec3], other: tuple[Vec3, Vec3]) -> float:
-    """Return the distance between two line segments, sampled at a twentieth of their length."""
-    return min(math.dist(_along(one, i / 20), _along(other, j / 20)) for i in range(21) for j in range(21))
+@dataclass(frozen=True)
+class _Stretch:
+    """Part of a member's mission: with the bar, or the way to it or from it."""
+
+    together: bool
+    where: str
+    places: list[Vec3]
+    """Positions of the body: with the bar one every `STEP_S`, else one every `PLACES_M`, and the last."""
 
 
-def _along(line: tuple[Vec3, Vec3], share: float) -> Vec3:
-    (ax, ay, az), (bx, by, bz) = line
-    return (ax + share * (bx - ax), ay + share * (by - ay), az + share * (bz - az))
+def _stretches(config: FlightConfig, plan: Plan) -> list[_Stretch]:
+    """Return the way to the bar, the stretch with it, and the way from it; and so on if the mission carries it several times."""
+    phases, found = phases_of(config.mission), list[_Stretch]()
+    for together, segments in itertools.groupby(
+        plan.segments, key=lambda segment: isinstance(phases[segment.index], Carry)
+    ):
+        places: list[Vec3] = []
+        for segment in segments:
+            count = math.ceil((segment.end_s - segment.start_s) / STEP_S)
+            for t_s in (*(segment.start_s + n * STEP_S for n in range(count)), segment.end_s):
+                place = plan.reference(t_s).position_world_m
+                if together or not places or t_s == segment.end_s or math.dist(place, places[-1]) >= PLACES_M:
+                    places.append(place)
+        where = "with the bar" if together else "on the ways from the bar" if found else "on the ways to the bar"
+        found.append(_Stretch(together, where, places))
+    return found
+
+
+def segments_apart_m(one: tuple[Vec3, Vec3], other: tuple[Vec3, Vec3]) -> float:
+    """Return the distance between two line segments, each given by its ends, which may be equal."""
+    (a, b), (c, d) = one, other
+    u, v, w = minus(b, a), minus(d, c), minus(a, c)
+    uu, uv, vv, uw, vw = dot(u, u), dot(u, v), dot(v, v), dot(u, w), dot(v, w)
+    divisor = uu * vv - uv * uv
+    if divisor > 0.0:
+        s, t = (uv * vw - vv * uw) / divisor, (uu * vw - uv * uw) / divisor
+        if 0.0 < s < 1.0 and 0.0 < t < 1.0:  # nearest between the ends of both; otherwise an end of one is nearest
+            return math.dist(plus(a, scaled(u, s)), plus(c, scaled(v, t)))
+    return min(_to_segment_m(a, other), _to_segment_m(b, other), _to_segment_m(c, one), _to_segment_m(d, one))
+
+
+def _to_segment_m(point: Vec3, line: tuple[Vec3, Vec3]) -> float:
+    along, length2 = minus(line[1], line[0]), math.dist(*line) ** 2
+    share = 0.0 if length2 == 0.0 else dot(minus(point, line[0]), along) / length2
+    return math.dist(point, plus(line[0], scaled(along, min(1.0, max(0.0, share)))))
