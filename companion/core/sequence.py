@@ -406,10 +406,14 @@ def missing_inputs(i: Inputs, vehicle: Vehicle) -> list[str]:
 
 
 def _nothing_from(missing: list[str]) -> str:
-    hint = (
-        "; PX4 sends no local position: check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3" if "PX4 state" in missing else ""
-    )
-    return f"no data from: {', '.join(missing)}{hint}"
+    hints = "".join(f"; {hint}" for device, hint in _HINTS.items() if device in missing)
+    return f"no data from: {', '.join(missing)}{hints}"
+
+
+_HINTS: Final = {
+    "PX4 state": "PX4 sends no local position: check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3",
+    "other vehicle": "start the other vehicle, as the other member and with the same key, and check the addresses in devices.team",
+}
 
 
 _STAGES: Final[Mapping[Stage, Callable[[Transition, float], AutopilotRequest]]] = {

@@ -110,7 +110,8 @@ class Flight:
             if self._devices.ground is not None:
                 self._devices.ground.report_tick(inputs, outputs)
             if self._guardian is not None:
-                self._guardian.tick(inputs, outputs)
+                link = self._devices.team
+                self._guardian.tick(inputs, outputs, 0 if link is None else link.partner_session)
             if outputs.outcome is not None:
                 return outputs.outcome
             if tick == 0 and self._devices.found_armed and not self._goes_on(outputs):

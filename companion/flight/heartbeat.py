@@ -53,8 +53,12 @@ class Heartbeats:
         self._left: tuple[Vec3, Vec3] | None = None
         """Way back from a surface, and where it begins, while a landing or a retract that has replaced the mission may still fly it."""
 
-    def of(self, inputs: Inputs, outputs: Outputs) -> Heartbeat:
-        """Return the heartbeat of a tick; call it in every tick."""
+    def of(self, inputs: Inputs, outputs: Outputs, partner_session: int = 0) -> Heartbeat:
+        """Return the heartbeat of a tick; call it in every tick.
+
+        Args:
+            partner_session: session of the other vehicle of a team; 0 for a vehicle that flies alone.
+        """
         ids = {event.id for event in outputs.events}
         self._pilot = self._pilot or PILOT_TOOK_OVER in ids or outputs.phase == PILOT_FLIES
         self._lands_without_mocap = self._lands_without_mocap or not ids.isdisjoint(_REFUSALS)
@@ -84,6 +88,7 @@ class Heartbeats:
             position_world_m=self._position_world_m,
             attitude_wxyz=self._attitude_wxyz,
             peer=link.peer,
+            partner_session=partner_session,
             back_world_m=self._back_world_m(outputs.contact),
         )
 
@@ -133,9 +138,9 @@ class HeartbeatSender:
         """Return whether the guardian would land if this process ended now."""
         return self._last is not None and self._last.lifting and self.ready
 
-    def tick(self, inputs: Inputs, outputs: Outputs) -> None:
-        """Send the heartbeat at the end of a tick, after its setpoint."""
-        self._last = self._heartbeats.of(inputs, outputs)
+    def tick(self, inputs: Inputs, outputs: Outputs, partner_session: int = 0) -> None:
+        """Send the heartbeat at the end of a tick, after its setpoint; `partner_session` as for `Heartbeats.of`."""
+        self._last = self._heartbeats.of(inputs, outputs, partner_session)
         self._client.send_heartbeat(self._last)
 
     def still_here(self) -> None:

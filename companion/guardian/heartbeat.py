@@ -57,6 +57,8 @@ class Heartbeat(Record, frozen=True, kw_only=True):
     """Attitude of the newest accepted pose."""
     peer: tuple[_Ipv4, _Port] | None = None
     """IPv4 address and UDP port of PX4, confirmed by the flight process; None if the link is not UDP."""
+    partner_session: Annotated[int, Meta(ge=0)] = 0
+    """Session of the other vehicle of a team (`companion.io.team_link`); 0 for a vehicle that flies alone."""
     back_world_m: Vec3 | None = None
     """The way back from a surface that the tool touches or approaches, before a landing; None if there is none."""
 

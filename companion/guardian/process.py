@@ -177,7 +177,7 @@ class Guardian:
             if monotonic() > deadline_s:
                 return None
             self._send_status()
-            self._announce(last.position_world_m)
+            self._announce(last, last.position_world_m)
             simulated_time.wait(select.poll(), PERIOD_S, data=False)
 
     def _open_wire(self, last: Heartbeat) -> OpenWire:
@@ -250,7 +250,7 @@ class Guardian:
                 with self._contain_errors(last, landing, "the landing"):
                     landing.step(t_s)
             self._send_status()
-            self._announce(last.position_world_m if landing.pose is None else landing.pose.position_world_m)
+            self._announce(last, last.position_world_m if landing.pose is None else landing.pose.position_world_m)
         self._send_result(landing.landed, landing)
         return landing.landed
 
@@ -272,10 +272,11 @@ class Guardian:
             if what == "the landing":
                 landing.restart(t_s)
 
-    def _announce(self, position_world_m: Vec3) -> None:
+    def _announce(self, last: Heartbeat, position_world_m: Vec3) -> None:
         """Tell the other vehicle of a team that PX4 lands this one, and that it will not lift the bar."""
         if self._team is not None:
             said = TeamState(grip=Grip.FREE, holds=True, lands=True, px4_lands=True, position_world_m=position_world_m)
+            self._team.answers = last.partner_session
             self._team.announce(said, monotonic())
 
     def _send_status(self) -> None:

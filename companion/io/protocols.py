@@ -187,6 +187,10 @@ class Team(Device, Protocol):
     def announce(self, said: TeamState) -> None:
         """Send this vehicle's state; called in each tick. Never waits."""
 
+    @property
+    def partner_session(self) -> int:
+        """Return the session of the newest announcement, which the guardian names; 0 before the first."""
+
     def newest(self) -> PartnerState | None:
         """Return the newest announcement of the other vehicle, or None before the first."""
 

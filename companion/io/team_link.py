@@ -1,9 +1,14 @@
 """The link between the vehicles of a team: 50 times a second each sends the other its state, one UDP datagram an announcement.
 
-A datagram is `MAGIC`, a counter (little endian, 64 bits), the state as MessagePack, and the first 16 bytes of the HMAC-SHA256 of
-sender, receiver and everything before. Only who has the key can announce; a datagram that is repeated, or sent back, is rejected. The
-counter is the sender's time in ns and increases strictly, so that a program that is started again, or the guardian after the flight
-process, is ahead of what was sent before. The sender's port does not matter, because the guardian has one of its own.
+A datagram is `MAGIC`, the sender's session, the receiver's session, a counter (each little endian, 64 bits), the state as MessagePack,
+and the first 16 bytes of the HMAC-SHA256 of sender, receiver and everything before. Only who has the key can announce.
+
+A session is a random number that a process draws when it opens the link. An announcement counts only if it names the session of the
+process that receives it: a recording from before that process was started, of this or another flight, proves nothing. Such a datagram
+is answered, so that the two learn each other's sessions within two announcements. Within a session the counter increases strictly, and
+a session that another has replaced has ended: a datagram that is repeated, or sent back, is rejected. No clock is involved, so that a
+process that is started again is heard at once, whatever the computer's time is. The guardian has a session of its own and takes that
+of the other vehicle from the flight process's heartbeats. The sender's port does not matter, because the guardian's is another.
 
 In simulated time both vehicles share the clock, and the counter is simulated time: a datagram arrives `SIMULATED_DELAY_S` after it was
 sent, however early it lies in the socket, so that it does not matter which of two processes works first at one instant.
@@ -15,12 +20,12 @@ import errno
 import hashlib
 import hmac
 import math
+import secrets
 import socket
 import struct
-import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 from companion.io.arrival import arrived_s
 from companion.io.mocap import sockets
@@ -34,12 +39,14 @@ from companion.runtime.clock import Clock
 PERIOD_S: Final = 0.02
 SIMULATED_DELAY_S: Final = 0.002
 KEY_BYTES_MIN: Final = 32
-MAGIC: Final = b"CTL1"
+LOST_S: Final = 0.3
+"""Silence of a session after which another one is answered."""
+MAGIC: Final = b"CTL2"
 """First bytes of a datagram; the digit is the version."""
-_HEAD: Final = struct.Struct("<4sQ")
+_HEAD: Final = struct.Struct("<4sQQQ")
 _PROOF_BYTES: Final = 16
 _BYTES_MAX: Final = 512
-_DOMAIN: Final = "companion team 1"
+_DOMAIN: Final = "companion team 2"
 _EPSILON_S: Final = 1e-9
 
 
@@ -95,6 +102,9 @@ class TeamSender:
             raise DeviceError(f"team {settings.partner}:{settings.partner_port}: {error.strerror}") from None
         self.partner_ip = settings.partner
         self._direction = direction(self.own_ip, *self._to)
+        self.session = 1 + secrets.randbits(62)
+        self.answers = 0
+        """Session of the other vehicle's process; 0 if it is unknown."""
         self._counter = 0
         self._due_s = -math.inf
         self.sent = self.unsent = 0
@@ -108,9 +118,10 @@ class TeamSender:
         if t_s < self._due_s:
             return
         self._due_s = t_s + PERIOD_S - _EPSILON_S
-        self._counter = max(self._counter + 1, _now_ns())
+        self._counter = max(self._counter + 1, _simulated_ns())
+        announcement = Announcement(self.session, self.answers, self._counter, said)
         try:
-            self._socket.sendto(encoded(said, self._counter, self.key, self._direction), self._to)
+            self._socket.sendto(encoded(announcement, self.key, self._direction), self._to)
             self.sent += 1
         except OSError:  # the network is down, or an ICMP error from an earlier datagram
             self.unsent += 1
@@ -120,6 +131,16 @@ class TeamSender:
         self._socket.close()
 
 
+class Announcement(NamedTuple):
+    """Content of a datagram."""
+
+    session: int
+    answers: int
+    """Session of the receiver, as far as the sender knows; 0 if it does not."""
+    counter: int
+    said: TeamState
+
+
 class TeamLink:
     """The flight process's end of the link; implements `companion.io.protocols.Team`."""
 
@@ -127,8 +148,11 @@ class TeamLink:
         self._settings, self._clock = settings, clock
         self._simulated = simulated_time.current()
         self._counts = LinkCounts()
-        self._counter = -1
-        self._arriving: list[PartnerState] = []
+        self._partner_session, self._counter = 0, -1
+        """Session of the newest announcement, and its counter."""
+        self._ended: set[int] = set()
+        """Sessions that have been replaced by another."""
+        self._arriving: list[tuple[float, Announcement]] = []
         """Announcements in the order of their arrival, the newest last; those of the future have not arrived yet."""
         self._newest: PartnerState | None = None
 
@@ -174,19 +198,37 @@ class TeamLink:
                 self._count("foreign")
             elif isinstance(found := decoded(datagram.data, self._sender.key, self._direction), str):
                 self._count(found)
-            elif found[0] <= self._counter:
-                self._count("repeated")
             else:
-                self._count("received")
-                self._counter, said = found
                 at_s = arrived_s(datagram.ancillary, self._clock)
                 if self._simulated is not None:
-                    at_s = self._counter * 1e-9 + SIMULATED_DELAY_S
-                self._arriving.append(PartnerState(stamp_s=at_s, said=said))
+                    at_s = found.counter * 1e-9 + SIMULATED_DELAY_S
+                self._arriving.append((at_s, found))
         now_s = self._clock() + _EPSILON_S
-        while self._arriving and self._arriving[0].stamp_s <= now_s:
-            self._newest = self._arriving.pop(0)
+        while self._arriving and self._arriving[0][0] <= now_s:
+            self._hear(*self._arriving.pop(0))
         return self._newest
+
+    @property
+    def partner_session(self) -> int:
+        """Return the session of the newest announcement; 0 before the first."""
+        return self._partner_session
+
+    def _hear(self, at_s: float, heard: Announcement) -> None:
+        """Accept an announcement, or count why not."""
+        session, answers, counter, said = heard
+        if answers != self._sender.session:
+            self._count("unanswered")
+            if self._newest is None or at_s - self._newest.stamp_s > LOST_S:
+                self._sender.answers = session
+        elif session in self._ended or (session == self._partner_session and counter <= self._counter):
+            self._count("repeated")
+        else:
+            self._count("received")
+            if session != self._partner_session:
+                self._ended.add(self._partner_session)
+            self._partner_session = self._sender.answers = session
+            self._counter = counter
+            self._newest = PartnerState(stamp_s=at_s, said=said)
 
     def _count(self, name: str) -> None:
         self._counts = self._counts._replace(**{name: getattr(self._counts, name) + 1})
@@ -197,14 +239,15 @@ def direction(sender_ip: str, receiver_ip: str, receiver_port: int) -> bytes:
     return f"{_DOMAIN}\n{sender_ip}\n{receiver_ip}:{receiver_port}\n".encode()
 
 
-def encoded(said: TeamState, counter: int, key: bytes, way: bytes) -> bytes:
+def encoded(announcement: Announcement, key: bytes, way: bytes) -> bytes:
     """Return the datagram of an announcement; `way` is that of `direction`."""
-    text = _HEAD.pack(MAGIC, counter) + to_packet(said)
+    session, answers, counter, said = announcement
+    text = _HEAD.pack(MAGIC, session, answers, counter) + to_packet(said)
     return text + _proof(way + text, key)
 
 
-def decoded(datagram: bytes, key: bytes, way: bytes) -> tuple[int, TeamState] | str:
-    """Return counter and state of a datagram, or the field of `LinkCounts` that counts why it is rejected."""
+def decoded(datagram: bytes, key: bytes, way: bytes) -> Announcement | str:
+    """Return the announcement of a datagram, or the field of `LinkCounts` that counts why it is rejected."""
     text, proof = datagram[:-_PROOF_BYTES], datagram[-_PROOF_BYTES:]
     if not _HEAD.size + _PROOF_BYTES < len(datagram) <= _BYTES_MAX or text[: len(MAGIC)] != MAGIC:
         return "malformed"
@@ -217,13 +260,15 @@ def decoded(datagram: bytes, key: bytes, way: bytes) -> tuple[int, TeamState] | 
     times_s = said.together.go_server_s or 0.0, said.together.plan_s, said.server_s or 0.0
     if not all(map(math.isfinite, (*times_s, *said.position_world_m))):
         return "malformed"
-    return int(_HEAD.unpack_from(text)[1]), said
+    _, session, answers, counter = _HEAD.unpack_from(text)
+    return Announcement(session, answers, counter, said)
 
 
 def _proof(text: bytes, key: bytes) -> bytes:
     return hmac.digest(key, text, hashlib.sha256)[:_PROOF_BYTES]
 
 
-def _now_ns() -> int:
+def _simulated_ns() -> int:
+    """Return simulated time; 0 in real time."""
     simulated = simulated_time.current()
-    return time.time_ns() if simulated is None else max(0, round(simulated.now() * 1e9))
+    return 0 if simulated is None else max(0, round(simulated.now() * 1e9))

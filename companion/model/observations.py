@@ -112,8 +112,10 @@ class LinkCounts(NamedTuple):
     """Datagrams of another length or version, or with a state that is not one."""
     forged: int = 0
     """Datagrams with a wrong proof."""
+    unanswered: int = 0
+    """Announcements to another process than this: from before the other vehicle heard this one, or recordings of an earlier flight."""
     repeated: int = 0
-    """Datagrams that are not newer than one before."""
+    """Announcements that are not newer than one before, or of a process that another has replaced."""
 
 
 class MocapStream(Record, frozen=True, kw_only=True):

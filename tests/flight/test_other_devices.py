@@ -231,6 +231,8 @@ class OtherForceTorque(Standing):
 
 
 class OtherTeam(Standing):
+    partner_session = 1
+
     def __init__(self, config: FlightConfig, clock: Clock) -> None:
         super().__init__(config, clock)
         self.announced: list[TeamState] = []

@@ -107,6 +107,8 @@ class Rig:
         team: TeamSettings | None = None,
     ) -> None:
         self._team = team
+        self.partner_session = 0
+        """What the flight process knows of the other vehicle of a team."""
         self._folder = folder
         self._address = address
         self._timeout_s = timeout_s
@@ -219,6 +221,7 @@ class Rig:
             position_world_m=POSITION_M,
             attitude_wxyz=ATTITUDE,
             peer=self.peer.address,
+            partner_session=self.partner_session,
         )
         self.beats.send(heartbeat.pack(beat))
 

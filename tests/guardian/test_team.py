@@ -27,6 +27,7 @@ async def test_after_the_takeover_it_announces_that_px4_lands_and_that_it_holds_
     own, other = team(key_file)
     async with TeamLink(other, flight_clock()) as link:
         with Rig(tmp_path, team=own) as rig:
+            rig.partner_session = link._sender.session
             rig.beat_until_ready()
             assert link.newest() is None and sum(link.counts()) == 0
             os.kill(rig.flight.pid, signal.SIGKILL)
