@@ -22,6 +22,7 @@ from companion.model.types import SafetyAction
 from companion.safety import notices
 from companion.sitl_config.faults import KINDS
 from companion.sitl_config.loader import load_sitl
+from companion.sitl_config.team import load_team
 from companion.sitl_config.world import Fault, World
 from sitl.autopilot.params import Params
 from tools.docs.faults import kinds_markdown
@@ -160,11 +161,13 @@ def test_commands_parse_and_their_overrides_are_accepted(monkeypatch: pytest.Mon
         # MISSION stands for any; a vehicle file that the user is to write is not there.
         of_flight = hasattr(arguments, "overrides")
         if of_flight and mission and mission.endswith(".yaml") and arguments.vehicle is None:
-            law, preset = (getattr(arguments, name, None) for name in ("controller", "preset"))
-            settings = (mission, law, preset, tuple(arguments.overrides))
-            if settings not in loaded:
+            law, preset, member = (getattr(arguments, name, None) for name in ("controller", "preset", "member"))
+            settings = (mission, law, preset, member, tuple(arguments.overrides))
+            if settings not in loaded and member is not None:
+                load_team(mission, arguments.overrides, controller_law=law, preset=preset)
+            elif settings not in loaded:
                 load_sitl(mission, None, law, preset, arguments.overrides)
-                loaded.add(settings)
+            loaded.add(settings)
     assert seen >= {"fly", "check", "sitl", "report", "replay", "schema"}
 
 
