@@ -82,9 +82,7 @@ def throw(one: TeamLink, data: bytes) -> None:
 
 def counted(link: TeamLink, name: str, number: int = 1) -> None:
     """Wait until this many datagrams were rejected for one reason."""
-    wait_until(
-        lambda: link.newest() is not Ellipsis and getattr(link.counts(), name) == number, lambda: str(link.counts())
-    )
+    wait_until(lambda: (link.newest(), getattr(link.counts(), name))[1] == number, lambda: str(link.counts()))
 
 
 def arrives(link: TeamLink, wanted: TeamState) -> float:
