@@ -105,6 +105,10 @@ def _fly(arguments: argparse.Namespace) -> int:
         for end, config in team.members
         for line in start_impossible(config) + no_bus_time(config, speed)
     ]
+    shown = {config.vehicle.ground.foxglove for _, config in team.members}
+    if len(shown) == 1 and None not in shown:
+        text = f"both members have ground.foxglove {shown.pop()}; give each a port of its own"
+        problems.append(f"{team.source}: {text}: --set right.vehicle.ground.foxglove=127.0.0.1:8766")
     if problems:
         raise ConfigError(problems)
     out = Path(arguments.out) if arguments.out else Path("flights") / f"{time_stamp()}-{team.name}"

@@ -54,6 +54,7 @@ from companion.recorder.viewer_scene import (
     MEETING,
     path_of,
     point3,
+    rotor_circle,
     sphere,
     static_entities,
     tether_colour,
@@ -147,6 +148,9 @@ class ViewerChannels:
                 self._ball(stamp, stamp_ns, outputs.ball)
             if inputs.bar is not None and inputs.bar.tracking_valid and t_s - inputs.bar.stamp_s <= _FRESH_S:
                 self._bar(stamp, stamp_ns, inputs.bar)
+            partner = inputs.partner
+            if partner is not None and not self._prefix and t_s - partner.stamp_s <= _FRESH_S:
+                self._partner(stamp, stamp_ns, partner.said.position_world_m)
             self._paths(t_s, stamp, stamp_ns, pose, outputs.reference)
 
     def _frames(
@@ -204,6 +208,16 @@ class ViewerChannels:
         line, handles = trail([point3(end) for end in ends], BAR, 8.0), [sphere(end, HANDLE_M, BAR) for end in ends]
         entity = SceneEntity(
             timestamp=stamp, frame_id="world", id="bar", lifetime=_LIFETIME, lines=[line], spheres=handles
+        )
+        self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
+
+    def _partner(self, stamp: Timestamp, stamp_ns: int, position_world_m: Vec3) -> None:
+        """Write where the other vehicle of a team is, as a disk of this one's size; a file with both vehicles shows it whole."""
+        if self._geometry is None or not _usable(position_world_m, (1.0, 0.0, 0.0, 0.0)):
+            return
+        disk = rotor_circle(position_world_m, self._geometry.radius_m)
+        entity = SceneEntity(
+            timestamp=stamp, frame_id="world", id="other vehicle", lifetime=_LIFETIME, cylinders=[disk]
         )
         self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
 

@@ -165,6 +165,18 @@ def _rod(end: Vec3) -> CylinderPrimitive:
     )
 
 
+def rotor_circle(centre: Vec3, radius_m: float) -> CylinderPrimitive:
+    """Return a flat disk that covers the rotors of a vehicle."""
+    x, y, z = centre
+    return CylinderPrimitive(
+        pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=_UPRIGHT),
+        size=Vector3(x=2.0 * radius_m, y=2.0 * radius_m, z=0.02),
+        bottom_scale=1.0,
+        top_scale=1.0,
+        color=_ROTOR,
+    )
+
+
 def sphere(centre: Vec3, radius_m: float, colour: Color) -> SpherePrimitive:
     """Return a sphere."""
     wide = 2.0 * radius_m

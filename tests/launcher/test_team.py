@@ -74,6 +74,10 @@ FLY = ("team", "fly", TEAM, "--sitl", "--world", "ideal", "--speed", "max", "--o
             "right: world.faults: bus_delay: the servo bus takes no time in simulated time; add --real-time",
         ),
         (
+            (*FLY, "--set", "vehicle.ground.foxglove=127.0.0.1:8765"),
+            "both members have ground.foxglove 127.0.0.1:8765; give each a port of its own",
+        ),
+        (
             (*FLY, "--set", "left.mission.start.takeoff=by_operator"),
             "left: mission.start.takeoff is by_operator (--wait-for-start), but start could not be commanded",
         ),
@@ -113,6 +117,7 @@ FLY = ("team", "fly", TEAM, "--sitl", "--world", "ideal", "--speed", "max", "--o
         "real time on hardware",
         "empty folder",
         "bus",
+        "foxglove",
         "start",
         "alone",
         "member",

@@ -22,7 +22,7 @@ from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rota
 from companion.model.hanging_line import hanging_line_m
 from companion.model.markers import BallState
 from companion.model.outputs import TetherState
-from companion.model.team import BarPose
+from companion.model.team import BarPose, Grip, PartnerState, TeamState
 from companion.model.types import Joints, MocapPose, Quat, Vec3
 from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
@@ -30,7 +30,7 @@ from tests.machines import overrides_with_joints
 from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
 from tests.recorder.test_layouts import TEAM
 from tests.recorder.viewers import Seen, Viewed, at_path, split_path, view
-from tests.support import tether_of
+from tests.support import HOVER, tether_of
 
 NAN = math.nan
 
@@ -395,6 +395,20 @@ def test_a_bar_is_drawn_between_its_handles_while_it_is_seen(tmp_path: Path) -> 
         if count:
             ends = [vec(end) for end in only(viewed.by_topic["/scene"], "bar")["lines"][0]["points"]]
             assert [value for end in ends for value in end] == pytest.approx([1.0, 2.6, 0.6, 1.0, 1.4, 0.6])
+
+
+def test_the_other_vehicle_of_a_team_is_drawn_where_it_says_it_is_while_it_is_heard(tmp_path: Path) -> None:
+    inputs, outputs, sent = still()[0]
+    said = TeamState(grip=Grip.FREE, holds=False, lands=False, px4_lands=False, position_world_m=(1.0, 2.0, 0.6))
+    for age_s, shown in ((0.02, True), (0.2, False)):
+        row = replace(inputs, partner=PartnerState(stamp_s=inputs.t_s - age_s, said=said)), outputs, sent
+        viewed = written(tmp_path / f"{age_s}.mcap", [row])
+        entities = [entity for message in viewed.by_topic["/scene"] for entity in message.data["entities"]]
+        disks = [entity["cylinders"][0] for entity in entities if entity["id"] == "other vehicle"]
+        assert len(disks) == shown
+        if shown:
+            assert vec(disks[0]["pose"]["position"]) == (1.0, 2.0, 0.6)
+            assert disks[0]["size"]["x"] == pytest.approx(2.0 * load_flight(HOVER).vehicle.airframe.radius_m)
 
 
 def test_a_file_shows_the_vehicles_of_several_logs_each_with_frames_and_topics_of_its_own(
