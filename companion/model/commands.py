@@ -19,7 +19,7 @@ class CommandRow(NamedTuple):
     """Key of the ground station's text display."""
     safer: bool
     """Every operator may give it, it is repeated until it is answered, and it overtakes all that are not safer. Any other needs a
-    confirmation: a second key press, or a long one.
+    confirmation: a second key, or a long press.
     """
     age_max_s: float
     """Age above which it is refused."""

@@ -207,7 +207,7 @@ async def terminal_at(broker: Broker, folder: Path) -> AsyncIterator[Terminal]:
 
 @pytest.mark.parametrize("after", [{"session": "s2"}, {"hold": 2}, {"vehicle": "second"}], ids=str)
 def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    """If vehicle, flight or hold has changed at the second press, it asks again; so it does if the two keys were pasted."""
+    """If vehicle, flight or hold has changed at the second key, the command must be given again; so it must if both were pasted."""
     now_s = 50.0
     monkeypatch.setattr("companion.ground.station.text_monitor.time.monotonic", lambda: now_s)
     access = broker_access("mqtt://127.0.0.1", None, None)
@@ -226,10 +226,29 @@ def test_a_confirmation_is_for_what_was_shown(after: dict[str, Any], monkeypatch
     assert screen._command("r", station) is None
     now_s += APART_S
     shown(**after)
-    assert [screen._command(key, station) for key in "rrr"] == [None] * 3
+    assert [screen._command(key, station) for key in "yyry"] == [None] * 4
     for waited_s, expected in ((CONFIRM_S, None), (APART_S, OperatorCommand.RESUME)):
+        assert screen._command("r", station) is None
         now_s += waited_s
-        assert screen._command("r", station) is expected
+        assert screen._command("y", station) is expected
+    assert [screen._command(key, station) for key in "rh"] == [None, OperatorCommand.HOLD]
+    now_s += APART_S
+    assert screen._command("y", station) is None
+
+
+@pytest.mark.parametrize("key", "rsy")
+@pytest.mark.parametrize("delay_s", [0.2, 0.5, 2.0])
+def test_a_held_key_gives_no_command_that_needs_confirmation(
+    key: str, delay_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 50.0
+    monkeypatch.setattr("companion.ground.station.text_monitor.time.monotonic", lambda: now_s)
+    access = broker_access("mqtt://127.0.0.1", None, None)
+    station = Station(access, SIGNER, None, lambda heard: None, lambda connected, text: None)
+    screen = _Screen(Console())
+    for repeat_s in (0.0, delay_s, *[0.033] * 300, 0.5, 1.0):  # and let go, pressed again
+        now_s += repeat_s
+        assert screen._command(key, station) is None
 
 
 async def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broker, tmp_path: Path) -> None:
@@ -238,10 +257,10 @@ async def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broke
         for key, name in (("h", "hold"), ("L", "land"), ("a", "abort")):
             await terminal.shows(f"rig: {name}: {name}: done (anna)", on=key)
         terminal.press("s")
-        await terminal.shows("start? press s again")
+        await terminal.shows("start? press y")
         terminal.press("r")
-        await terminal.shows("resume? press r again")
-        await terminal.shows("rig: resume: resume: done (anna)", on="rr")
+        await terminal.shows("resume? press y")
+        await terminal.shows("rig: resume: resume: done (anna)", on="ry")
         # One whose answer is late is sent again.
         assert list(dict.fromkeys(heard.command.value for heard in vehicle.accepted)) == [
             "hold",

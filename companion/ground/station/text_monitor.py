@@ -26,9 +26,11 @@ from companion.runtime.terminal import pressed, raw_keys
 
 PERIOD_S = 0.125
 LINE_PERIOD_S = 1.0
+CONFIRM_KEY = "y"
+"""Confirms a command. It is another key than the command's, because a terminal does not tell a repeated key from a held one."""
 APART_S, CONFIRM_S = 0.25, 3.0
-"""Shortest and longest time after which the key of a command that needs confirmation must be pressed again. Keys that arrive faster
-are pasted: "pass" must not start a flight.
+"""Shortest and longest time after a command's key at which `CONFIRM_KEY` confirms it. Keys that arrive faster are pasted: "easy" must
+not start a flight.
 """
 KEYS_MAX = 100
 KEYS = {row.key: row.command for row in TABLE}
@@ -74,7 +76,7 @@ class _Screen:
         self._notices: deque[Notice] = deque(maxlen=10)
         self._chosen: str | None = None
         self._unconfirmed: tuple[OperatorCommand, float, tuple[object, ...]] | None = None
-        """Command that awaits a second key press, when the wait began, and its target at that time (`_target`)."""
+        """Command that awaits `CONFIRM_KEY`, when the wait began, and its target at that time (`_target`)."""
         self._keys: deque[str] = deque(maxlen=KEYS_MAX)
         self._pressed = asyncio.Event()
 
@@ -120,21 +122,19 @@ class _Screen:
             if self._chosen in names:
                 self._chosen = names[(names.index(self._chosen) + 1) % len(names)]
         command = KEYS.get(key)
+        unconfirmed, self._unconfirmed = self._unconfirmed, None
         if command in SAFER_COMMANDS:
             return command
-        unconfirmed, self._unconfirmed = self._unconfirmed, None
-        if command is None:
-            return None
         now_s, target = time.monotonic(), _target(self._vehicle(station))
-        if (
-            unconfirmed is not None
-            and unconfirmed[0] is command
-            and APART_S <= now_s - unconfirmed[1] < CONFIRM_S
-            and unconfirmed[2] == target
-        ):
-            return command
-        self._unconfirmed = (command, now_s, target)
-        self._notices.append(Notice(f"{command.value}? press {key} again within {CONFIRM_S:g} s", "bold yellow"))
+        if command is not None:
+            self._unconfirmed = (command, now_s, target)
+            text = f"{command.value}? press {CONFIRM_KEY} after {APART_S:g} to {CONFIRM_S:g} s"
+            self._notices.append(Notice(text, "bold yellow"))
+        elif key == CONFIRM_KEY and unconfirmed is not None:
+            asked, asked_s, asked_target = unconfirmed
+            if APART_S <= now_s - asked_s < CONFIRM_S and asked_target == target:
+                return asked
+            self._notices.append(Notice(f"{asked.value}: not confirmed; begin again", "bold yellow"))
         return None
 
     def _on_progress(self, note: Sent | Failed) -> None:
