@@ -75,7 +75,9 @@ def movie_of(log: FlightLog, summary: dict[str, Any]) -> Movie | None:
         return None
     try:
         scene = Scene(log.config["vehicle"])
-    except (KeyError, TypeError):
+    except (KeyError, ValueError):
+        return None
+    if scene.joint_count != log.joint_count:
         return None
     first, last = int(flying[0]), _end(log, flying, scene)
     if last <= first:

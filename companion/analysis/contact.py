@@ -10,7 +10,7 @@ import numpy as np
 
 from companion.analysis.arm_skeleton import pose
 from companion.analysis.log import Array, FlightLog
-from companion.model.arm_skeleton import ArmSkeleton, logged_skeleton
+from companion.model.arm_skeleton import ArmSkeleton
 from companion.model.best_pose import best_pose
 from companion.model.contact import ContactMode, ContactState
 from companion.model.frames import quat_rotate
@@ -211,7 +211,7 @@ def tips_m(log: FlightLog, used: Any) -> tuple[Array, Array, Array, Array] | Non
     """Return the measured and the planned position of the tip, world frame, m, the last direction of the contact, and the ticks to
     which they belong: those of `used` in which all is known. None if it never is.
     """
-    skeleton = logged_skeleton(log.config.get("vehicle"))
+    skeleton = log.arm_skeleton
     if skeleton is None:
         return None
     measured, planned, ticks, direction = [], [], [], (0.0, 0.0, 0.0)

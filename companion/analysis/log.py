@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
+import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,8 +22,10 @@ from pydantic import ValidationError
 from zstandard import ZstdError
 
 from companion import DISTRIBUTION
-from companion.analysis.timing import Stopwatch, Timing, timing_of
+from companion.analysis.logged_config import checked_config, checked_path
+from companion.analysis.timing import Stopwatch, Timing, plausible, timing_of
 from companion.config.loader import FlightConfig, logged_flight
+from companion.model.arm_skeleton import ArmSkeleton, logged_skeleton
 from companion.model.best_pose import best_pose
 from companion.model.codec import RecordError, from_json
 from companion.model.constants import GRADED_POSE_MAX_AGE_S
@@ -44,6 +46,10 @@ _FORMER_NAMES = (
     (b'"id":"arm_let_go"', b'"id":"servo_watchdog_tripped"'),
 )
 """Keys and ids of logs of the previous release, and their current names."""
+
+
+_EPOCH_NS_MAX, _T_S_MAX = 3 * 10**18, 1e9
+"""Limits of the wall clock at 0 of the flight clock, ns, and of the flight clock, s. Viewers store the sum's seconds in 32 bits."""
 
 
 class LogError(Exception):
@@ -81,8 +87,9 @@ class FlightLog:
                 memory. None keeps all, which a replay needs.
 
         Raises:
-            LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, or has records whose
-                fields differ from those of this version. An optional field that an older log lacks is read as None.
+            LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, has metadata with invalid
+                values, or has records whose fields differ from those of this version. An optional field that an older log lacks is
+                read as None.
         """
         rows = _Rows(ticks_max)
         metadata: dict[str, dict[str, str]] = {}
@@ -114,7 +121,7 @@ class FlightLog:
             raise LogError(f"{path}: an MCAP file, but not a flight log: it has no 'companion' metadata record")
         if not rows.whole():
             raise LogError(f"{path}: damaged: /inputs, /outputs and /sent hold different ticks")
-        return FlightLog(
+        log = FlightLog(
             path=path,
             inputs=tuple(row[0] for row in rows.kept),
             outputs=tuple(row[1] for row in rows.kept),
@@ -124,6 +131,28 @@ class FlightLog:
             stride=rows.stride,
             measured=rows.measured,
         )
+        log._check()
+        return log
+
+    def _check(self) -> None:
+        offset = self.metadata["companion"].get("epoch_offset_ns", "0")
+        if not re.fullmatch(r"-?[0-9]{1,19}", offset) or abs(int(offset)) > _EPOCH_NS_MAX:
+            raise LogError(
+                f"{self.path}: metadata 'companion', epoch_offset_ns: got {offset[:40]!r}, expected a time in ns"
+            )
+        for name, read in (("config", lambda: self.config), ("plan", lambda: self.planned_path)):
+            try:
+                read()
+            except ValueError as error:
+                raise LogError(f"{self.path}: metadata '{name}': {error}") from None
+        wrong = next((one for one in chain(self.inputs, self.outputs) if not abs(one.t_s) <= _T_S_MAX), None)
+        if wrong is not None:
+            raise LogError(f"{self.path}: damaged: tick {wrong.tick} has the time {wrong.t_s} s (limit {_T_S_MAX:g} s)")
+
+    @property
+    def epoch_offset_ns(self) -> int:
+        """Return the wall-clock time at 0 of the flight clock in ns; 0 if it is unknown."""
+        return int(self.metadata["companion"].get("epoch_offset_ns", "0"))
 
     @property
     def config_json(self) -> str | None:
@@ -151,12 +180,17 @@ class FlightLog:
 
     @cached_property
     def config(self) -> dict[str, Any]:
-        """Return the effective configuration as plain nested data; empty if absent."""
-        try:
-            parsed = json.loads(self.config_json or "{}")
-        except ValueError:
-            return {}
-        return parsed if isinstance(parsed, dict) else {}
+        """Return the effective configuration as plain nested data; empty if absent.
+
+        Raises:
+            ValueError: it is invalid, which `read` has excluded.
+        """
+        return checked_config(self.config_json or "{}")
+
+    @property
+    def planned_path(self) -> list[list[float]]:
+        """Return the points of the planned path, world frame, m; empty if absent."""
+        return checked_path(self.metadata.get("plan", {}).get("json") or "[]")
 
     def missing_ticks(self) -> int:
         """Return the number of ticks between the first and the last one that are not in the log."""
@@ -181,6 +215,12 @@ class FlightLog:
             if inputs.arm is not None:
                 return len(inputs.arm.angle_rad)
         return 0
+
+    @cached_property
+    def arm_skeleton(self) -> ArmSkeleton | None:
+        """Skeleton of arm and tool in the configuration; None if it has no arm or one with another number of joints."""
+        skeleton = logged_skeleton(self.config.get("vehicle"))
+        return skeleton if skeleton is not None and len(skeleton.joint_axes) == self.joint_count else None
 
     def column(self, value: Callable[[Inputs, Outputs, Sent], Any], width: int | None = None) -> Array:
         """Return one row per tick: a float (`width` None) or `width` floats; NaN where `value` returns None."""
@@ -223,13 +263,17 @@ class FlightLog:
 
 
 def array_of(values: Sequence[Any], width: int | None = None) -> Array:
-    """Return one row per value: a float (`width` None) or `width` floats; NaN where the value is None."""
+    """Return one row per value: a float (`width` None) or `width` floats; NaN where the value is None, or a number is infinite or so
+    large that no quantity of a flight has it.
+    """
     if width is None:
-        return np.array([math.nan if v is None else v for v in values], dtype=np.float64)
-    blank = (math.nan,) * width
-    # Half the time that np.array needs for a list of tuples.
-    flat = np.fromiter(chain.from_iterable([blank if v is None else v for v in values]), np.float64)
-    return flat.reshape(len(values), width)
+        found = np.array([math.nan if v is None else v for v in values], dtype=np.float64)
+    else:
+        blank = (math.nan,) * width
+        # Half the time that np.array needs for a list of tuples.
+        flat = np.fromiter(chain.from_iterable([blank if v is None else v for v in values]), np.float64)
+        found = flat.reshape(len(values), width)
+    return plausible(found)
 
 
 def _cells(record: Any) -> dict[str, Any]:

@@ -13,7 +13,6 @@ import numpy.typing as npt
 from companion.analysis.arm_skeleton import pose
 from companion.analysis.log import Array, FlightLog
 from companion.control.sensing import CatchDetector, ObservedCatchDetector
-from companion.model.arm_skeleton import logged_skeleton
 from companion.model.best_pose import best_pose
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.frames import quat_rotate
@@ -181,8 +180,8 @@ def impedance_error(log: FlightLog) -> tuple[float | None, float | None]:
 def _joint_torque_error_nm(log: FlightLog, used: Mask) -> Array:
     """Return J'(F - F_d) for the ticks of the mask, N m, (ticks, joints); NaN if the logged configuration does not describe the arm."""
     joints = log.joint_count
-    skeleton = logged_skeleton(log.config.get("vehicle"))
-    if skeleton is None or len(skeleton.joint_axes) != joints:
+    skeleton = log.arm_skeleton
+    if skeleton is None:
         return np.full((int(used.sum()), joints), np.nan)
     force = log.column(lambda i, o, s: o.control.force_ext_world_n if o.control else None, 3)[used]
     passing = np.stack([_passing(column, TICK_PERIOD_S / DESIRED_FORCE_TIME_S) for column in force.T.tolist()], axis=1)

@@ -133,7 +133,9 @@ def _movie(truth: BarTruth, sides: tuple[Course, Course], t_s: Array, errors: Ar
         return None
     try:
         scenes = [Scene(side.log.config["vehicle"]) for side in sides]
-    except (KeyError, TypeError):
+    except (KeyError, ValueError):
+        return None
+    if any(scene.joint_count != side.log.joint_count for scene, side in zip(scenes, sides, strict=True)):
         return None
     length_m = logged_bar_length_m(sides[0].log.config)
     if length_m is None:

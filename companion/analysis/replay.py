@@ -127,7 +127,8 @@ def _check_plugins(log: FlightLog) -> None:
     flight = log.metadata.get("flight", {})
     flew = [(PHASES, key.removeprefix("phase_"), value) for key, value in flight.items() if key.startswith("phase_")]
     if "law_distribution" in flight:  # not in older logs, of one of the companion's own laws
-        flew.insert(0, (CONTROL_LAWS, flight["law"], f"{flight['law_distribution']} {flight['law_version']}"))
+        version = flight.get("law_version", "of unknown version")
+        flew.insert(0, (CONTROL_LAWS, flight.get("law", "unknown"), f"{flight['law_distribution']} {version}"))
     for group, name, package in flew:
         plugin = installed(group).get(name)
         here = None if plugin is None else f"{plugin.distribution} {plugin.version}"

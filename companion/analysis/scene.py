@@ -121,7 +121,7 @@ class Scene:
         """Read the geometry from the `vehicle` section of an effective configuration.
 
         Raises:
-            KeyError, TypeError, ValueError, AttributeError: the section lacks a value or has an invalid one.
+            KeyError, ValueError: the section, which `FlightLog.read` has checked, lacks a value or describes no vehicle.
         """
         found = logged_geometry(vehicle)
         self._rotors_m = found.rotors.positions_body_m
@@ -134,6 +134,11 @@ class Scene:
     def standing_height_m(self) -> float:
         """Height of the body's origin while the vehicle rests on the ground, world z."""
         return float(self._low[2] + self._foot_m)
+
+    @property
+    def joint_count(self) -> int:
+        """Number of the arm's joints."""
+        return len(self._arm.joint_axes)
 
     def net_world_m(self, pose: Pose) -> Array:
         """Return the centre of the net, world frame, m."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -117,7 +118,17 @@ def summarise(
         intercept=_chase(log),
         graded_every=log.stride,
     )
-    return summary
+    finite: dict[str, Any] = _finite(summary)
+    return finite
+
+
+def _finite(value: Any) -> Any:
+    """Return nested data with None for NaN and infinity, as a log with such values gives them."""
+    if isinstance(value, dict):
+        return {key: _finite(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _chase(log: FlightLog) -> dict[str, Any] | None:

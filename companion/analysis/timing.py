@@ -45,6 +45,7 @@ class Timing:
     """Time from the start of the joint read until the currents are written, for the same ticks as `joint_read_to_write_s`."""
 
 
+_LARGEST = 1e12
 _KEPT = tuple(field.name for field in fields(Timing) if field.type == "Array")
 
 
@@ -70,8 +71,14 @@ class Stopwatch:
     def read(self) -> Timing:
         """Return the timing of the ticks added so far."""
         (first_tick, first_s), (last_tick, last_s) = self._first or (0, 0.0), self._last or (-1, 0.0)
-        durations = {name: np.array(kept) for name, kept in self._kept.items()}
+        durations = {name: plausible(np.array(kept)) for name, kept in self._kept.items()}
         return Timing(self._ticks, first_tick, last_tick, last_s - first_s, **durations)
+
+
+def plausible(values: Array) -> Array:
+    """Return the array after NaN has replaced infinity and numbers so large that no quantity of a flight has them."""
+    values[np.abs(values) > _LARGEST] = np.nan
+    return values
 
 
 def timing_of(rows: Iterable[tuple[Inputs, Outputs, Sent]]) -> Timing:

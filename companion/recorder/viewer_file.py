@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import json
-import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -34,7 +32,7 @@ def write_viewer_file(logs: Mapping[str, FlightLog], path: Path) -> None:
         OSError: the file exists or cannot be written.
     """
     context = foxglove.Context()
-    epochs_ns = {name: int(log.metadata["companion"].get("epoch_offset_ns", "0")) for name, log in logs.items()}
+    epochs_ns = {name: log.epoch_offset_ns for name, log in logs.items()}
     if all(log.clock == "simulated" for log in logs.values()):
         epochs_ns = dict.fromkeys(logs, max(epochs_ns.values()))
     file = LogFile(path)  # of a full disk the writer says only that a write has failed
@@ -55,7 +53,7 @@ def _write(context: foxglove.Context, logs: Mapping[str, FlightLog], epochs_ns: 
     viewers = {name: ViewerChannels(context, f"{name}/") for name in logs}
     for name, log in logs.items():
         viewers[name].configure(log.config)
-        viewers[name].plan(json.loads(log.metadata.get("plan", {}).get("json", "null")))
+        viewers[name].plan(log.planned_path)
     ticks = [_ticks(name, log, epochs_ns[name]) for name, log in logs.items()]
     for stamp_ns, name, inputs, outputs in heapq.merge(*ticks, key=lambda tick: tick[0]):
         viewers[name].tick(stamp_ns, inputs, outputs)
@@ -67,5 +65,6 @@ def _write(context: foxglove.Context, logs: Mapping[str, FlightLog], epochs_ns: 
 
 def _ticks(name: str, log: FlightLog, epoch_ns: int) -> Iterator[tuple[int, str, Inputs, Outputs]]:
     for inputs, outputs, _ in log.rows():
-        if math.isfinite(inputs.t_s):
-            yield epoch_ns + round(inputs.t_s * 1e9), name, inputs, outputs
+        stamp_ns = epoch_ns + round(inputs.t_s * 1e9)
+        if stamp_ns >= 0:
+            yield stamp_ns, name, inputs, outputs

@@ -46,7 +46,7 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
         raise LogError(f"{path}: has no ticks")
     config = log.flight_config()
     session = f"log-{number}"
-    streams, events = replay(log.rows(), config, session, _epoch_offset_s(log), max_records=STREAMS_MAX)
+    streams, events = replay(log.rows(), config, session, 1e-9 * log.epoch_offset_ns, max_records=STREAMS_MAX)
     parts = {
         "state": _state(log, config, session),
         "scene": scene_of(config, session, _reference_path(log), mission_s=log.outputs[-1].mission_t_s),
@@ -56,13 +56,6 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
     }
     body = gzip.compress(to_json(parts), _GZIP_LEVEL, mtime=0)
     return ReplayLog(str(path), body)
-
-
-def _epoch_offset_s(log: FlightLog) -> float:
-    try:
-        return int(log.metadata["companion"]["epoch_offset_ns"]) / 1e9
-    except (KeyError, ValueError):
-        return 0.0  # wall time is for display only
 
 
 def _reference_path(log: FlightLog) -> list[Vec3]:
@@ -75,7 +68,7 @@ def _preflight(log: FlightLog) -> tuple[PreflightRow, ...]:
     try:
         rows = json.loads(log.metadata.get("preflight", {}).get("json", "[]"))
         return tuple(PreflightRow(str(row["id"]), str(row["level"]), str(row["text"])) for row in rows)
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         return ()
 
 
@@ -91,7 +84,7 @@ def _state(log: FlightLog, config: FlightConfig, session: str) -> State:
         mission=config.mission.name,
         law=config.controller.law,
         preset=config.controller.preset,
-        wall_s=_epoch_offset_s(log) + log.inputs[-1].t_s,
+        wall_s=1e-9 * log.epoch_offset_ns + log.inputs[-1].t_s,
         commands=False,
         outcome=None if outcome is None else outcome.value,
         text=f"{log.path}, {writer(log.metadata)}" + ("" if log.closed else "; the log was not closed"),
