@@ -68,5 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
     except ImportError:
         raise ConfigError(f"companion export: needs pandas and pyarrow: pip install '{DISTRIBUTION}[pandas]'") from None
     except OSError as error:
+        if error.filename is None:
+            raise  # of standard output
         raise ConfigError(f"companion export: {error.filename}: cannot be written: {error.strerror}") from None
     return EXIT_OK

@@ -136,7 +136,7 @@ def install(root: Path, plan: Plan, user: str, report: Report) -> bool:
         )
         if isinstance(error, KeyboardInterrupt):
             raise
-        why = error if isinstance(error, InstallError) else f"{error.filename}: {error.strerror}"
+        why = error if isinstance(error, InstallError) else f"{error.filename or 'standard output'}: {error.strerror}"
         if trouble:
             raise InstallError(
                 f"{why}; not restored: {trouble}; fix that, then run: companion install --undo"
@@ -204,7 +204,7 @@ def undo(root: Path, report: Report) -> bool:
         under_root(root, RECORD_PATH).unlink()
     except OSError as error:
         raise InstallError(
-            f"{error.filename}: {error.strerror}; fix that, then run: companion install --undo"
+            f"{error.filename or 'standard output'}: {error.strerror}; fix that, then run: companion install --undo"
         ) from None
     for folder in _remove_folders(root, record.folders):
         report(f"kept {folder}: it is not empty")

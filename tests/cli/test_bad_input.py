@@ -17,6 +17,7 @@ import pytest
 
 from companion.cli.main import main
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from tests.analysis.synthetic_flight import record_flight
 from tests.support import CATCH, ROOT, Ended, Sandbox, sandbox_in
 
 VEHICLE = ROOT / "configs/vehicles/tarot650_2r.yaml"
@@ -226,11 +227,18 @@ def test_the_line_that_a_copy_of_the_files_suggests_flies_from_any_folder(
     assert shlex.split(line) == ["companion", "fly", str(tmp_path / "my files/missions/catch.yaml"), "--sitl"]
 
 
-def test_output_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", ["schema mission", "export flight.mcap --format csv"])
+def test_output_that_cannot_be_written_is_one_line(command: str, tmp_path: Path) -> None:
+    if command.startswith("export"):
+        pytest.importorskip("pandas")
+        record_flight(tmp_path / "flight.mcap", end_s=1.0)
     with open("/dev/full", "w") as full:
         ended = subprocess.run(
-            [sys.executable, "-P", "-m", "companion", "schema", "mission"],
+            [sys.executable, "-P", "-u", "-m", "companion", *command.split()],
             stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
         )  # fmt: skip
+    name = command.partition(" ")[0]
     assert ended.returncode == EXIT_BAD_INPUT
-    assert ended.stderr.splitlines() == ["companion schema: standard output cannot be written: No space left on device"]
+    assert ended.stderr.splitlines() == [
+        f"companion {name}: standard output cannot be written: No space left on device"
+    ]

@@ -158,16 +158,21 @@ def fail_at_the_third_file(monkeypatch: pytest.MonkeyPatch, failure: BaseExcepti
 
 @pytest.mark.parametrize(
     ("failure", "code"),
-    [(OSError(errno.ENOSPC, "No space left on device", "/etc/x"), EXIT_REFUSED), (KeyboardInterrupt(), EXIT_ABORTED)],
-    ids=["full disk", "Ctrl-C"],
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "/etc/x"), EXIT_REFUSED),
+        (OSError(errno.ENOSPC, "No space left on device"), EXIT_REFUSED),
+        (KeyboardInterrupt(), EXIT_ABORTED),
+    ],
+    ids=["full disk", "full standard output", "Ctrl-C"],
 )
 def test_a_failure_half_way_leaves_everything_as_it_was(
     root: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException, code: int
 ) -> None:
     before = tree(root)
     fail_at_the_third_file(monkeypatch, failure)
-    install(root, code=code)
+    ended = install(root, code=code)
     assert tree(root) == before
+    assert "None" not in ended.err
 
 
 def test_a_change_that_fails_half_way_leaves_the_first_installation(
