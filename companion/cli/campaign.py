@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import shlex
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -67,8 +68,24 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def refuse_beside(arguments: argparse.Namespace, option: str, others: Sequence[str]) -> None:
+    """Raise ConfigError if the command line has an option and others that it makes meaningless."""
+    given = {word.partition("=")[0] for word in shlex.split(arguments.command_line)}
+    useless = [other for other in others if other in given]
+    if option in given and useless:
+        raise ConfigError(
+            f"companion {arguments.command}: {', '.join(useless)}: has no effect with {option}; leave it out"
+        )
+
+
 def common(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the fields of a `Campaign` that the shared options set."""
+    """Return the fields of a `Campaign` that the shared options set.
+
+    Raises:
+        ConfigError: of two options, one makes the other meaningless.
+    """
+    refuse_beside(arguments, "--scheduler", ["--jobs"])
+    refuse_beside(arguments, "--plan", ["--out", "--keep"])
     return {
         "command": arguments.command_line,
         "overrides": arguments.overrides,

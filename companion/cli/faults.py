@@ -10,7 +10,7 @@ from typing import Any
 from companion.analysis.table import for_terminal
 from companion.campaigns.faults.campaign import Faults, kinds_list, kinds_table
 from companion.campaigns.faults.variants import WIRES, planned, touches
-from companion.cli.campaign import add_options, checked, common, fly, names, wide_console
+from companion.cli.campaign import add_options, checked, common, fly, names, refuse_beside, wide_console
 from companion.cli.options import MISSION_OR_DEFAULT_HELP, add_seed
 from companion.config.document import ConfigError
 from companion.config.explain import nearest
@@ -20,6 +20,11 @@ from companion.runtime.console import print_error
 from companion.sitl_config.faults import CONTACT_PHASES, KINDS, PHASES, absent_part
 from companion.sitl_config.loader import COMMAND_LINE_WORLD
 
+_OF_FLIGHTS = (
+    *("--kinds", "--phases", "--wires", "--vehicle", "--controller", "--preset", "--set", "--world"),
+    *("--seed", "--jobs", "--scheduler", "--out"),
+)
+"""Options that have no effect on `--list`."""
 CONTACT_MISSION, SLIDING_MISSION, CONTACT_WORLD = "press", "slide", "wall"
 
 
@@ -67,6 +72,8 @@ def _known(known: Sequence[str], what: str) -> Callable[[str], tuple[str, ...]]:
 
 
 def run(arguments: argparse.Namespace) -> int:
+    refuse_beside(arguments, "--list", _OF_FLIGHTS)
+    refuse_beside(arguments, "--wires", ["--scheduler"])
     if not arguments.list:
         return fly(_campaign(arguments), arguments, "faults")
     if arguments.json:

@@ -9,7 +9,7 @@ from typing import Any
 from companion.campaigns.pair import PairRobustness
 from companion.campaigns.robustness.campaign import Robustness
 from companion.campaigns.robustness.cases import Case, Cases, read_cases
-from companion.cli.campaign import add_options, add_plan, checked, common, count, fly, why_unusable
+from companion.cli.campaign import add_options, add_plan, checked, common, count, fly, refuse_beside, why_unusable
 from companion.cli.options import MISSION_OR_DEFAULT_HELP
 from companion.config.document import ConfigError
 from companion.config.shipped import DEFAULT_MISSION, names
@@ -69,6 +69,7 @@ def _of_team(arguments: argparse.Namespace) -> PairRobustness:
     """Return the campaign of a team file; raises ConfigError, one line per problem."""
     if arguments.cases is not None or arguments.keep is not None or arguments.vehicle is not None:
         raise ConfigError("companion robustness: a team file takes no --cases, --keep and --vehicle")
+    _check_case(arguments)
     world = arguments.world or TEAM_WORLD
     team = load_team(
         arguments.mission,
@@ -96,8 +97,8 @@ def _of_team(arguments: argparse.Namespace) -> PairRobustness:
 
 def _campaign(arguments: argparse.Namespace) -> Robustness:
     """Return the campaign, after checking its configuration and its cases; raises ConfigError, one line per problem."""
-    if arguments.case and arguments.cases is None:
-        raise ConfigError("companion robustness: --case needs --cases FILE, the file that contains the case")
+    _check_case(arguments)
+    refuse_beside(arguments, "--cases", ["--draws", "--seed", "--first"])
     kept: Cases | None = None
     cases: tuple[Case, ...] = ()
     if arguments.cases is not None:
@@ -132,6 +133,11 @@ def _campaign(arguments: argparse.Namespace) -> Robustness:
         vehicle=vehicle,
         controller=law,
     )
+
+
+def _check_case(arguments: argparse.Namespace) -> None:
+    if arguments.case and arguments.cases is None:
+        raise ConfigError("companion robustness: --case needs --cases FILE, the file that contains the case")
 
 
 def _check_keep(arguments: argparse.Namespace) -> None:

@@ -7,7 +7,7 @@ import shlex
 from typing import Any
 
 from companion.campaigns.tune.tune import Tune, plan, run
-from companion.cli.campaign import CAMPAIGN_WIDTH, add_options, checked, count, results_folder, wide_console
+from companion.cli.campaign import CAMPAIGN_WIDTH, add_options, checked, common, count, results_folder, wide_console
 from companion.cli.options import MISSION_OR_DEFAULT_HELP
 from companion.config.document import ConfigError
 from companion.config.shipped import DEFAULT_MISSION
@@ -74,9 +74,6 @@ def _tune(arguments: argparse.Namespace) -> Tune:
         seed=arguments.seed,
         training=arguments.laboratories,
         held_out=arguments.held_out,
-        command=arguments.command_line,
         fly=shlex.join(words),
-        overrides=arguments.overrides,
-        jobs=arguments.jobs,
-        scheduler=arguments.scheduler,
+        **common(arguments),
     )

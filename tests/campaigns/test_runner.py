@@ -231,6 +231,35 @@ def test_a_file_of_cases_loses_none_that_was_not_flown(monkeypatch: pytest.Monke
     assert [case.kept.e_p_m for case in read_cases(Path("kept.yaml")).cases] == [0.02, 0.01]
 
 
+@pytest.mark.parametrize(
+    ("words", "useless"),
+    [
+        (("robustness", "--cases", "kept.yaml", "--draws", "5"), "--draws"),
+        (("robustness", "--cases=kept.yaml", "--first=3", "--seed", "1"), "--seed, --first"),
+        (("robustness", "--draws", "5", "--plan", "--keep", "kept.yaml"), "--keep"),
+        (("compare", "--plan", "--out", "here"), "--out"),
+        (("compare", "--scheduler", "tcp://x", "--jobs", "2"), "--jobs"),
+        (("tune", "--plan", "--out", "here"), "--out"),
+        (("tune", "--scheduler", "tcp://x", "--jobs", "2"), "--jobs"),
+        (("faults", "--list", "--kinds", "servo_loss"), "--kinds"),
+        (("faults", "--list", "--wires"), "--wires"),
+        (("faults", "--wires", "--scheduler", "tcp://x"), "--scheduler"),
+    ],
+    ids=str,
+)
+def test_an_option_without_effect_is_refused(words: tuple[str, ...], useless: str) -> None:
+    ended = run_here(*words)
+    assert ended.code == EXIT_BAD_INPUT
+    [line] = ended.err_lines
+    assert line.startswith(f"companion {words[0]}: {useless}") and ": has no effect with --" in line
+
+
+def test_a_case_of_a_team_is_refused() -> None:
+    ended = run_here("robustness", "carry", "--case", "draw 1")
+    assert ended.code == EXIT_BAD_INPUT
+    assert ended.err_lines == ["companion robustness: --case needs --cases FILE, the file that contains the case"]
+
+
 CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
 
 
