@@ -73,6 +73,11 @@ class Report:
     brief: Mapping[str, str] = field(default_factory=dict)
     """Titles by id prefix: rows with this prefix that are ok are printed as one line."""
 
+    @property
+    def lines(self) -> list[str]:
+        """Return the report as lines, without the change to the vehicle file."""
+        return [*self.text, *row_lines(self.rows, self.brief), *self.advice]
+
 
 class Session:
     """One run of a tool.
@@ -98,6 +103,11 @@ class Session:
     def say(self, text: str, style: str = "") -> None:
         """Print one line of instructions."""
         self.console.print(Text(text, style=style), soft_wrap=True)
+
+    def show(self, report: Report) -> None:
+        """Print a report among the instructions, for a question about it."""
+        for line in report.lines:
+            self.say(line)
 
     def ask(self, question: str) -> bool | None:
         """Ask a yes-or-no question, which `--yes` answers with yes; return None if there is no terminal."""
@@ -163,7 +173,10 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
     except Cancelled as end:
         print_error(f"companion {tool.name}: {end}")
         return EXIT_ABORTED
-    patch, written, problem = _change_file(session, tool.family, report.changes)
+    if not arguments.json:  # before the question whether to write what it proposes
+        for line in report.lines:
+            print(line, flush=True)
+    patch, written, problem = _change_file(session, tool.family, report)
     settled = not patch or (written is not None and tool.family.ok_when_written)
     ok = problem is None and settled and (not refusals(report.rows) if report.ok is None else report.ok)
     if arguments.json:
@@ -179,12 +192,7 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
         }
         print(json.dumps(document, allow_nan=False))
     else:
-        for line in (
-            *report.text,
-            *row_lines(report.rows, report.brief),
-            *report.advice,
-            *_patch_lines(patch, written, problem),
-        ):
+        for line in _patch_lines(patch, written, problem):
             print(line)
     if problem is not None:
         raise problem  # after what was measured, which would be lost
@@ -192,23 +200,25 @@ def run_tool(tool: Tool[Any], arguments: argparse.Namespace) -> int:
 
 
 def _change_file(
-    session: Session, family: Family, changes: Mapping[Location, Data]
+    session: Session, family: Family, report: Report
 ) -> tuple[Patch | None, str | None, ConfigError | None]:
     """Return the proposed change, the backup if it is written, and why it cannot be proposed or written."""
     patch = None
     try:
-        if changes:
-            patch = propose(named_file("vehicles", session.arguments.vehicle, "--vehicle"), changes)
-        return patch, str(patch.write()) if patch and _may_write(session, family, patch) else None, None
+        if report.changes:
+            patch = propose(named_file("vehicles", session.arguments.vehicle, "--vehicle"), report.changes)
+        return patch, str(patch.write()) if patch and _may_write(session, family, patch, report) else None, None
     except ConfigError as error:
         return patch, None, error
 
 
-def _may_write(session: Session, family: Family, patch: Patch) -> bool:
+def _may_write(session: Session, family: Family, patch: Patch, report: Report) -> bool:
     if not getattr(session.arguments, "write", False):
         return False
     if not family.asks_before_writing or session.arguments.yes:
         return True
+    if session.arguments.json:
+        session.show(report)
     session.say(patch.text)
     return session.confirm(f"write this to {patch.shown}?")
 

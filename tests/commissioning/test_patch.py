@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import re
 import shutil
@@ -22,6 +23,8 @@ from companion.commissioning.yaml_edit import edited
 from companion.config.document import ConfigError, Data, Origin
 from companion.config.loader import load_vehicle
 from companion.config.yaml_strict import parse_value, read_document
+from companion.model.exit_codes import EXIT_REFUSED
+from companion.preflight.checks import Check
 from tests.support import ROOT
 
 SHIPPED = ROOT / "configs/vehicles/tarot650_2r.yaml"
@@ -140,6 +143,34 @@ def test_what_was_measured_is_printed_even_if_the_file_cannot_be_changed(
     printed = capsys.readouterr().out
     assert printed.startswith("measured\n") and "add --write" not in printed
     assert ("+    rigid_body_id: 7" in printed) is (value == 7)
+
+
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_what_was_measured_is_printed_before_the_question_whether_to_write_it(
+    mine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: tuple[str, ...]
+) -> None:
+    read: list[str] = []
+
+    class Keyboard(io.StringIO):
+        """A user who reads what is on the screen before answering no."""
+
+        def isatty(self) -> bool:
+            return True
+
+        def readline(self, size: int = -1, /) -> str:
+            read.append("".join(capsys.readouterr()))
+            return "n\n"
+
+    monkeypatch.setattr("sys.stdin", Keyboard())
+    rows = [Check("mocap.body", "body", why="").row(True, "is number 7", "", "")]
+    report = Report(
+        rows, text=["measured"], changes={("devices", "mocap", "rigid_body_id"): 7}, advice=["measure again"]
+    )
+    arguments = make_parser().parse_args(["mocap", "check", "--vehicle", str(mine), "--write", *options])
+    assert run_tool(Tool("mocap check", SENSORS, lambda _: None, lambda *_: report), arguments) == EXIT_REFUSED
+    [shown] = read
+    assert all(text in shown for text in ("measured", "is number 7", "measure again", "+    rigid_body_id: 7", "[y/N]"))
+    assert ("is number 7" in capsys.readouterr().out) is bool(options), "printed once, and in the JSON"
 
 
 def test_a_file_that_was_changed_meanwhile_is_not_written(mine: Path) -> None:

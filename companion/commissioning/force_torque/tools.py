@@ -179,12 +179,8 @@ async def watch_drift(session: Session) -> Tared:
         option = "--sensor" if arguments.sensor else "--clear"
         text = f"{option}: only the {RFT60} has a zero of its own to set; devices.force.type is {device.type}"
         raise ConfigError(f"companion ft tare: {text}")
-    for wanted, question in (
-        (arguments.sensor, "set the sensor's own zero to the current reading?"),
-        (arguments.clear, "clear the sensor's own zero?"),
-    ):
-        if wanted and not session.confirm(question):
-            raise Cancelled("nothing was written to the sensor")
+    if arguments.clear and not session.confirm("clear the sensor's own zero?"):
+        raise Cancelled("nothing was written to the sensor")
     clock = flight_clock()
     async with open_force(device, clock) as sensor, arm_angles(vehicle, clock, given_rad) as angles_rad:
         if arguments.clear and isinstance(sensor, RobotousForceTorque):
@@ -197,6 +193,10 @@ async def watch_drift(session: Session) -> Tared:
         seen = Tared(samples, first, await angles_rad())
         if not (arguments.sensor and isinstance(sensor, RobotousForceTorque)):
             return seen
+        if not arguments.yes:
+            session.show(judge_drift(seen, vehicle))
+        if not session.confirm("set the sensor's own zero to the current reading?"):
+            raise Cancelled("nothing was written to the sensor")
         await sensor.set_bias(True)
         return replace(seen, zeroed=await sensor.tare_samples(TARE_S))
 

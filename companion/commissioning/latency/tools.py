@@ -108,6 +108,8 @@ async def measure(session: Session) -> Measured:
         if not arguments.write or measured.total_ms is None:
             return measured
         value, max_ms = round(measured.total_ms, _DIGITS), _max_ms(vehicle)
+        if not arguments.yes:
+            session.show(judge(measured, vehicle))
         if not 0.0 <= measured.total_ms <= max_ms:
             session.say(f"{PARAMETER} is not written: {measured.total_ms:.1f} ms is outside 0 to {max_ms:g} ms")
         elif session.confirm(f"write {PARAMETER} = {value:g} ms to PX4?"):
