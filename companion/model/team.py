@@ -24,6 +24,8 @@ class ClampState(Record, frozen=True):
     """Flight clock at which the angle was read."""
     angle_rad: float
     """Angle of the shaft (register 132)."""
+    hardware_error: int | None = None
+    """Hardware error (register 70), which switches the servo's torque off; None if there is none."""
 
 
 class BarPose(Record, frozen=True, kw_only=True):

@@ -65,6 +65,8 @@ class ArmTracker:
     def __init__(self) -> None:
         self._age = Age()
         self._newest: ArmState | None = None
+        self.clamp_error = 0
+        """Hardware error of the clamp's servo (register 70); 0 without one."""
         self.arm: ArmState | None = None
         self.before: ArmState | None = None
         """Previous joint state; None if this tick has no new one."""
@@ -91,6 +93,7 @@ class ArmTracker:
             self.refused_s = min(self.refused_s + dt_s, 2.0 * REFUSED_MAX_S)
         elif self.refused_s > 0.0:
             self.refused_s -= REFUSED_FORGOTTEN * dt_s
+        self.clamp_error = 0 if i.clamp is None else i.clamp.hardware_error or 0
         arm = self.arm = i.arm
         self.age_s = self._age.update(awake_s, arm.stamp_s if arm else None)
         self.before, self.hottest_c = None, -math.inf
@@ -156,6 +159,11 @@ def servo_error(a: ArmTracker, _: None) -> Values | None:
             if error & ~WATCHDOG_ERROR:
                 return (error_text(arm.hardware_error),)
     return None
+
+
+def clamp_error(a: ArmTracker, _: None) -> Values | None:
+    """Fires if the clamp's servo reports a hardware error."""
+    return (hardware_error_text(a.clamp_error),) if a.clamp_error else None
 
 
 def servo_watchdog_tripped(a: ArmTracker, _: None) -> Values | None:

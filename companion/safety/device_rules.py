@@ -205,6 +205,11 @@ DEVICE_RULES: tuple[Rule, ...] = (
         predicate=arm.servo_error, ground=_LAND, air=_LAND, message="hardware error (register 70) of {}",
     ),
     Rule(
+        id="clamp_error", subject=Subject.ARM,
+        what="the clamp's servo reports a hardware error (register 70): it has no torque and may let the bar go",
+        predicate=arm.clamp_error, ground=_LAND, air=_LAND, message="hardware error (register 70) of the clamp's servo: {}",
+    ),
+    Rule(
         id="servo_watchdog_tripped", subject=Subject.ARM, what="a servo's bus watchdog has switched its torque off",
         predicate=arm.servo_watchdog_tripped, ground=_WARN, air=_WARN,
         message="a servo's bus watchdog had switched its torque off; it is on again",

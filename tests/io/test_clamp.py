@@ -142,6 +142,24 @@ async def test_the_turns_that_the_servo_has_lost_are_added() -> None:
         await asyncio.wait_for(until(lambda: register(clamp.servo, 116, 4) == goal), DEADLINE_S)
 
 
+async def test_a_clamp_that_shuts_down_while_it_grips_reports_why() -> None:
+    clamp = Clamp()
+    async with on_bus(clamp) as (arm, _):
+        await taken(arm, clamp, ClampCommand.CLOSE, EMPTY_DEG)
+        clamp.run(1.0)
+        await seen_deg(arm, EMPTY_DEG)
+        gripping = arm.clamp()
+        assert gripping is not None and gripping.hardware_error is None
+        clamp.servo.trip_overload()
+
+        async def reads() -> None:
+            while (state := arm.clamp()) is None or state.hardware_error != 32:
+                await arm.read(1.0)
+
+        await asyncio.wait_for(reads(), DEADLINE_S)
+        assert register(clamp.servo, 64) == 0 and "overload" in arm.problem
+
+
 async def test_the_joints_go_on_while_the_clamp_is_silent_and_its_state_grows_old() -> None:
     clamp = Clamp()
     async with on_bus(clamp) as (arm, _):

@@ -12,7 +12,7 @@ from companion.config.loader import load_vehicle
 from companion.config.vehicle import Vehicle
 from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.outputs import ControlLog
-from companion.model.team import BarPose, Grip
+from companion.model.team import BarPose, ClampState, Grip
 from companion.model.types import FlightMode, Inputs, OperatorCommand
 from companion.safety.flight_context import FlightContext
 from companion.safety.rule import Rule, Subject
@@ -278,6 +278,7 @@ FAULTS: dict[str, Fault] = {
     "joint_swings_on": Fault(swinging_joint, also=frozenset({"joint_swings"})),
     "torque_refused": Fault(context=lambda: flying(torque_refused="joint torque (nan, 0.0) is not finite")),
     "servo_error": Fault(put("arm", hardware_error=(0, 32))),
+    "clamp_error": Fault(lambda i: replace(i, clamp=ClampState(i.t_s, 3.0, hardware_error=32))),
     "servo_watchdog_tripped": Fault(put("arm", hardware_error=(0x80, 0))),
     "servo_warm": Fault(put("arm", temperature_c=(35.0, 68.0))),
     "servo_hot": Fault(put("arm", temperature_c=(76.0, 35.0))),

@@ -69,6 +69,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "joint_swings_on": (LAND, LAND, 1.695),
     "torque_refused": (LAND, PX4_LANDS, 0.105),  # the law itself computes nonsense: not even its landing can be trusted
     "servo_error": (LAND, LAND, 0.015),
+    "clamp_error": (LAND, LAND, 0.015),  # the bar may fall at any time: set it down
     "servo_watchdog_tripped": (WARN, WARN, 0.015),  # its torque is on again
     "joint_jump": (LAND, LAND, 0.015),
     "servo_warm": (WARN, WARN, 0.515),
@@ -127,7 +128,7 @@ READS = """
     yaw_disagrees 20 15; estimator_silent 0.25; vision_rejected 1.2 1; px4_rebooted 2.0; link_slow 30 20; link_late 100 35;
     vehicle_state_lost 0.25; heartbeat_lost 2.5; px4_disarmed 1.00; battery_warn 25 30; battery_low 10 20;
     battery_silent 10; battery_voltage 13.0 13.2; arm_lost 0.10; arm_read_failures 5; joint_states_late 8 5 12 8;
-    joint_swings 1 16 86; joint_swings_on 1 16 86; torque_refused 0.0; servo_error 70 2;
+    joint_swings 1 16 86; joint_swings_on 1 16 86; torque_refused 0.0; servo_error 70 2; clamp_error 70;
     joint_jump 2 29; servo_warm 68 65; servo_hot 76 75; servo_overload -2.5 0.1; joint_rate 0 745 700;
     joint_beyond_limit 180 57 5; joint_far_beyond_limit 115 -25 15; force_lost 0.25; force_overload 1 -1 0;
     force_drift 3.3 0.0 0.0 2.0; force_disagrees 0.0 0.0 0.8 0.0 0.0 -0.8;

@@ -54,8 +54,8 @@ class DynamixelArm(ThreadedArm[tuple[Block, ...], Counts]):
     def _read_bus(self) -> tuple[Block, ...] | None:
         answer, jaws = self._bus.read(), self._bus.jaws
         if answer is not None and jaws is not None:
-            if (angle_rad := jaws.angle_rad) is not None:
-                self._clamp = ClampState(self._clock(), angle_rad)
+            if jaws.block is not None and (angle_rad := jaws.angle_rad) is not None:
+                self._clamp = ClampState(self._clock(), angle_rad, jaws.block.hardware_error or None)
             self.problem = jaws.problem or self.problem
         return answer
 
