@@ -9,7 +9,7 @@ from companion.guardian.client import GuardianClient
 from companion.guardian.heartbeat import Heartbeat
 from companion.model.best_pose import best_pose, pose_used_s
 from companion.model.contact import ContactMode, ContactState
-from companion.model.flight_stage import PILOT_FLIES
+from companion.model.flight_stage import PILOT_FLIES, flown_by_pilot
 from companion.model.outputs import Outputs
 from companion.model.types import (
     IDENTITY_QUAT,
@@ -92,6 +92,27 @@ class Heartbeats:
             back_world_m=self._back_world_m(outputs.contact),
         )
 
+    def found_armed(self, t_s: float, status: AutopilotStatus | None) -> Heartbeat:
+        """Return the heartbeat of a process that lands a vehicle that it has found armed, without the core."""
+        link = self._identity
+        return Heartbeat(
+            tick=0,
+            t_s=t_s,
+            origin_s=self._origin_s,
+            mission_t_s=0.0,
+            lifting=True,
+            pilot=flown_by_pilot(status),
+            goodbye=False,
+            mocap_refused=False,
+            autopilot_system=link.autopilot_system,
+            own_system=link.own_system,
+            own_component=link.own_component,
+            local_port=link.local_port,
+            pose_stamp_s=self._pose_stamp_s,
+            position_world_m=self._position_world_m,
+            peer=link.peer,
+        )
+
     def may_be_armed(self, status: AutopilotStatus | None, t_s: float) -> bool:
         """Return whether PX4 is armed, or may be since the last request to arm."""
         return may_be_armed(status, t_s, self._arm_s)
@@ -141,6 +162,11 @@ class HeartbeatSender:
     def tick(self, inputs: Inputs, outputs: Outputs, partner_session: int = 0) -> None:
         """Send the heartbeat at the end of a tick, after its setpoint; `partner_session` as for `Heartbeats.of`."""
         self._last = self._heartbeats.of(inputs, outputs, partner_session)
+        self._client.send_heartbeat(self._last)
+
+    def begin_without_core(self, t_s: float, status: AutopilotStatus | None) -> None:
+        """Send the first heartbeat of a process that lands a vehicle that it has found armed, without the core."""
+        self._last = self._heartbeats.found_armed(t_s, status)
         self._client.send_heartbeat(self._last)
 
     def still_here(self) -> None:

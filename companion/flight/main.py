@@ -100,6 +100,7 @@ async def fly(
             config = await operator.unless_land(with_hover_thrust(config, devices.autopilot))
             if client is not None:
                 await operator.unless_land(client.wait_ready())
+        guardian = HeartbeatSender(client, devices.autopilot.identity(), origin_s) if client is not None else None
         try:
             recorder = await asyncio.to_thread(
                 RecorderProcess.start,
@@ -121,9 +122,13 @@ async def fly(
         except DeviceError as error:
             if not devices.found_armed:
                 raise
-            print(error, file=sys.stderr)  # no log, but a landing
-            outcome = await land_without_core(devices.autopilot, channel, clock, None)
+            if guardian is not None:
+                guardian.begin_without_core(clock(), devices.autopilot.status())
+            print(error, file=sys.stderr, flush=True)  # no log, but a landing
+            outcome = await land_without_core(devices.autopilot, channel, clock, guardian)
             ipc.send(channel, FlightEnded(outcome))
+            if guardian is not None and guardian.goodbye(devices.autopilot.status(), lost=outcome is Outcome.LOST):
+                await asyncio.sleep(TAKEOVER_S)  # the guardian ends this process
             return outcome
         try:
             if not devices.found_armed:
@@ -131,7 +136,6 @@ async def fly(
             if checked is not None:
                 checked.log_to(recorder.client)
                 operator.recheck = partial(changed_since, checked.params, devices.autopilot)
-            guardian = HeartbeatSender(client, devices.autopilot.identity(), origin_s) if client is not None else None
             if client is not None:
                 client.share_recorder(recorder.client.fileno())
             flight = Flight(config, devices, recorder, channel, operator, clock, guardian)

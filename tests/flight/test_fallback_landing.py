@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 from dataclasses import dataclass, field
+from functools import partial
 
 import pytest
+from msgspec.structs import replace
 
 from companion.flight.fallback_landing import land_without_core
-from companion.model.types import AutopilotRequest, AutopilotStatus, FlightMode, LandedState, Outcome
+from companion.flight.heartbeat import HeartbeatSender
+from companion.guardian.client import GuardianClient
+from companion.guardian.heartbeat import MAX_BYTES, READY, unpack
+from companion.model.types import AutopilotRequest, AutopilotStatus, FlightMode, LandedState, LinkIdentity, Outcome
 
 
 @dataclass
@@ -36,3 +42,33 @@ def test_landing_is_requested_until_px4_says_that_it_is_down_or_the_time_is_over
         outcome = asyncio.run(land_without_core(link, ours, lambda: next(times_s), None))
     assert outcome is Outcome.LOST
     assert len(link.requested) >= 2 and set(link.requested) == {AutopilotRequest.LAND}
+
+
+@pytest.mark.parametrize("disarms", [False, True], ids=["px4-stays-armed", "px4-disarms"])
+def test_a_vehicle_that_is_found_armed_and_cannot_be_recorded_has_a_guardian(disarms: bool) -> None:
+    """It hears of the vehicle in the air before the first request to land, and is dismissed only once PX4 has disarmed."""
+    armed = AutopilotStatus(heartbeat_stamp_s=0.0, armed=True, mode=FlightMode.LAND, landed=LandedState.IN_AIR)
+    link = Link(seen=armed)
+    peer = ("127.0.0.1", 14540)
+    identity = LinkIdentity(autopilot_system=1, own_system=1, own_component=191, local_port=14550, peer=peer)
+    times_s = iter([0.0, *(10.0 * n for n in range(9))])
+    pair = partial(socket.socketpair, socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    (ours, launcher), (client_end, guardian_end) = pair(), pair()
+    with ours, launcher, client_end, guardian_end:
+        guardian_end.send(READY)
+        guardian = HeartbeatSender(GuardianClient(client_end, lambda: 1.0), identity, 5.0)
+        guardian.begin_without_core(1.0, armed)
+        outcome = asyncio.run(land_without_core(link, ours, lambda: next(times_s), guardian))
+        if disarms:
+            link.seen = replace(armed, armed=False, heartbeat_stamp_s=2.0)
+        takes_over = guardian.goodbye(link.seen, lost=not disarms)
+        heard = []
+        guardian_end.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                heard.append(unpack(guardian_end.recv(MAX_BYTES)))
+    assert outcome is Outcome.LOST
+    *during, last = heard
+    assert len(during) > 2 and all(one is not None and one.lifting and not one.goodbye for one in during)
+    assert during[0] is not None and (during[0].peer, during[0].origin_s, during[0].pilot) == (peer, 5.0, False)
+    assert last is not None and last.goodbye and last.lifting is not disarms and takes_over is not disarms
