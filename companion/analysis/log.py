@@ -145,9 +145,12 @@ class FlightLog:
                 read()
             except ValueError as error:
                 raise LogError(f"{self.path}: metadata '{name}': {error}") from None
-        wrong = next((one for one in chain(self.inputs, self.outputs) if not abs(one.t_s) <= _T_S_MAX), None)
-        if wrong is not None:
-            raise LogError(f"{self.path}: damaged: tick {wrong.tick} has the time {wrong.t_s} s (limit {_T_S_MAX:g} s)")
+        for inputs, outputs in zip(self.inputs, self.outputs, strict=True):
+            for t_s in (inputs.t_s, outputs.t_s):
+                if not abs(t_s) <= _T_S_MAX:
+                    raise LogError(
+                        f"{self.path}: damaged: tick {inputs.tick} has the time {t_s} s (limit {_T_S_MAX:g} s)"
+                    )
 
     @property
     def epoch_offset_ns(self) -> int:
