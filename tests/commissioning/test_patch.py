@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import io
 import os
 import re
 import shutil
@@ -151,13 +150,13 @@ def test_what_was_measured_is_printed_before_the_question_whether_to_write_it(
 ) -> None:
     read: list[str] = []
 
-    class Keyboard(io.StringIO):
+    class Keyboard:
         """A user who reads what is on the screen before answering no."""
 
         def isatty(self) -> bool:
             return True
 
-        def readline(self, size: int = -1, /) -> str:
+        def readline(self, *_: object) -> str:
             read.append("".join(capsys.readouterr()))
             return "n\n"
 
