@@ -21,9 +21,8 @@ OLDER_FINGERPRINTS = (
     "d9237ed1d1bff80d",  # before a law could optimise its gains in flight: `ControlLog.impedance_scale`
     "d2306038621d169b",  # before a tip could slide: `Reference.slide_world_n`, fields of the contact
     "f5ff3bacfaa725ce",  # before a slide corrected the measured force and steered: `unseen_n`, `steer_rad`
-    "1210f8bc9eeae0e5",  # before the clamp's hardware error was recorded
     "22c8aa0a4bbe44d5",  # the same records; their schema called fields of the contact required that a log leaves out
-    "1210f8bc9eeae0e5",  # before the members of a team compared themselves: `AutopilotStatus.system_id`, `TeamState.agreed`
+    "1210f8bc9eeae0e5",  # before clamp errors, and what members of a team compare: `AutopilotStatus.system_id`, `TeamState.agreed`
 )
 """Fingerprints of records that lack only fields that have a default now."""
 
