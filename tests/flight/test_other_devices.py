@@ -48,8 +48,9 @@ from companion.model.types import (
 )
 from companion.recorder.client import RecorderProcess
 from companion.runtime import ipc
-from companion.runtime.clock import Clock, flight_clock
-from tests.support import DEADLINE_S, HOVER, ROOT
+from companion.runtime.clock import Clock
+from tests.flight.simulated import SimulatedTime, simulated
+from tests.support import HOVER, ROOT
 
 ZERO = (0.0, 0.0, 0.0)
 RECORDED = MocapCounts(
@@ -252,9 +253,15 @@ class OtherTeam(Standing):
 def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path, in_a_team: bool) -> None:
     clamp = ROOT / "configs/vehicles/tarot650_2r_clamp.yaml" if in_a_team else None
     overrides = ["vehicle.devices.team={}", "vehicle.tether=null"] if in_a_team else []
-    config, clock = unflown(load_flight(HOVER, clamp, overrides=overrides)), flight_clock()
+    config = unflown(load_flight(HOVER, clamp, overrides=overrides))
     launcher, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     channel.setblocking(False)
+
+    time = SimulatedTime()
+
+    def clock() -> float:
+        return time.now_s
+
     autopilot, arm = ObedientAutopilot(config, clock), OtherArm(config, clock)
     team = OtherTeam(config, clock) if in_a_team else None
     autopilot.on_armed = lambda: ipc.send(launcher, Land())
@@ -267,16 +274,15 @@ def test_a_flight_with_devices_of_another_make_arms_and_lands(tmp_path: Path, in
         team=team,
     )
 
-    async def flown() -> Outcome:
+    async def flown(loop: asyncio.AbstractEventLoop, time: SimulatedTime) -> Outcome:
         operator = Operator(channel)
         with operator.attention():
-            async with asyncio.timeout(DEADLINE_S):
-                return await Flight(config, devices, recorder, channel, operator, clock, None).run()
+            return await Flight(config, devices, recorder, channel, operator, clock, None).run()
 
     with launcher, channel:
         recorder = RecorderProcess.start(tmp_path / "a.mcap", config_json=config.model_dump_json(), epoch_offset_ns=0)
         try:
-            assert asyncio.run(flown()) is Outcome.ABORTED
+            assert simulated(flown, time) is Outcome.ABORTED
         finally:
             recorder.finish()
     assert autopilot.mode is FlightMode.OFFBOARD and autopilot.setpoints > 0 and not autopilot.armed

@@ -3,40 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import itertools
-import selectors
-from collections.abc import Callable, Coroutine, Iterable
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.flight.ticker import EARLY_S, LATE_S, Ticker, TickTime
+from tests.flight.simulated import SimulatedTime, simulated
 
 P = 0.005
 RATE_HZ = 1.0 / P
-T = TypeVar("T")
-
-
-class SimulatedTime(selectors.SelectSelector):
-    """Waiting takes no time, it only is later afterwards."""
-
-    now_s = 0.0
-
-    def select(self, timeout: float | None = None) -> Any:
-        assert timeout is not None, "everything waits for something that nobody will do"
-        self.now_s += max(0.0, timeout)
-        return super().select(0.0)
-
-
-def simulated(run: Callable[[asyncio.AbstractEventLoop, SimulatedTime], Coroutine[Any, Any, T]]) -> T:
-    """Run a coroutine in an event loop on simulated time."""
-    time = SimulatedTime()
-    with contextlib.closing(asyncio.SelectorEventLoop(time)) as loop:
-        loop.time = lambda: time.now_s  # type: ignore[method-assign]
-        return loop.run_until_complete(run(loop, time))
 
 
 def ticks_of(
