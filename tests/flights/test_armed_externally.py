@@ -63,32 +63,6 @@ def test_hung_beside_a_hung_guardian_and_started_again_without_the_arm_it_lands_
     sandbox.assert_nobody_left()
 
 
-def test_found_in_the_air_without_a_log_it_is_landed_by_the_guardian_if_the_flight_process_dies(
-    sandbox: Sandbox,
-) -> None:
-    with World(sandbox, HOVER, ["world.payload_kg=0", SLOW]) as world:
-        with sandbox.start("fly", HOVER, "--out", "first", *HIGH, *world.addresses()) as first:
-            first.wait_for("  hold\n")
-            for name in ("guardian.pid", "flight.pid"):
-                os.kill(int((sandbox.cwd / "first" / name).read_text()), signal.SIGSTOP)
-            world.process.send_signal(signal.SIGSTOP)
-            assert first.end().code == EXIT_LOST
-        second = sandbox.cwd / "second"
-        second.mkdir()
-        (second / "flight.mcap").symlink_to("/proc/none/flight.mcap")  # where no file can be made
-        with sandbox.start("fly", HOVER, "--out", "second", *world.addresses()) as flying:
-            wait_until((second / "flight.pid").exists, lambda: "no flight process")
-            pid = int((second / "flight.pid").read_text())
-            wait_until(lambda: has_udp_socket(pid), lambda: (second / "flight.log").read_text())
-            world.process.send_signal(signal.SIGCONT)
-            wait_until(lambda: "flight.mcap" in (second / "flight.log").read_text(), lambda: flying.out)
-            os.kill(pid, signal.SIGKILL)
-            ended = flying.end()
-        assert "guardian_took_over" in ids(read_summary(second)), (ended.out, ended.err)
-        wait_until(lambda: at_rest(world), lambda: str(world.messages[-3:]))
-    sandbox.assert_nobody_left()
-
-
 def at_rest(world: World) -> bool:
     rests = [message["at_rest"] for message in world.messages if message["type"] == "WorldAtRest"]
     return bool(rests) and rests[-1]
