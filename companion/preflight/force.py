@@ -26,8 +26,8 @@ DEVICE = Check(
 RATE = Check(
     "force.rate",
     "force sensor rate",
-    "at least 90 % of `devices.force.rate_hz`; refused below 50 %",
-    "a catch is detected late, or not at all",
+    "at least 90 % of `devices.force.rate_hz`; refused below 50 % and above 150 %",
+    "a catch is detected late, or not at all: readings of a faster sensor may wait, and are taken for new ones",
 )
 CHECKSUMS = Check(
     "force.checksums",
@@ -77,7 +77,7 @@ _OBSERVED = (
     "detected, and a snagged tether may count as a catch"
 )
 _COMPARE = "fly a catch with force sensor and force_source: observer first, and compare both forces in the report"
-RATE_GOOD, RATE_MIN = 0.9, 0.5
+RATE_GOOD, RATE_MIN, RATE_MAX = 0.9, 0.5, 1.5
 NOISE_GOOD_N, NOISE_MAX_N = 0.3, 1.5
 TARE_GOOD, TARE_MAX = 0.05, 0.10
 
@@ -142,6 +142,8 @@ def stream_rows(
 def _rate(rate_hz: float, device: ForceDevice) -> Row:
     expected_hz = device.rate_hz
     read, wanted = f"{rate_hz:.0f} Hz", f"{expected_hz} Hz"
+    if rate_hz > RATE_MAX * expected_hz:
+        return RATE.bad(read, wanted, "set the sensor, or devices.force.rate_hz, to the other's rate")
     fix = "check cable and adapter; power-cycle the sensor"
     return RATE.graded(rate_hz >= RATE_GOOD * expected_hz, rate_hz >= RATE_MIN * expected_hz, read, wanted, fix)
 

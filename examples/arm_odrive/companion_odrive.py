@@ -6,6 +6,7 @@ torques N m of the motor; `gear_ratio` relates them to the output shaft.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import socket
 import struct
@@ -117,7 +118,13 @@ class ODriveArm:
         self._can.send(FRAME.pack(node << 5 | command | remote, 8 if remote else len(data), data))
 
     def _ask(self, commands: Sequence[int], timeout_s: float = 0.0) -> list[list[bytes]]:
-        """Ask every node for these values; return the newest answers in the order of the nodes and commands."""
+        """Ask every node for these values; return its answers in the order of the nodes and commands. Frames that have arrived before
+        are dropped: late answers, which would be taken for new ones in this and every later cycle, and cyclic messages.
+        """
+        self._can.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            while self._can.recv(FRAME.size):
+                pass
         wanted = [node << 5 | command for node in self._nodes for command in commands]
         for node in self._nodes:
             for command in commands:

@@ -7,6 +7,8 @@ endian. The box's web page sets the RDT rate, and shows the counts per unit of f
 
 from __future__ import annotations
 
+import contextlib
+import select
 import socket
 import struct
 
@@ -43,18 +45,24 @@ class AtiNetFt:
 
     def open(self) -> None:
         """Start the stream."""
-        self._socket.settimeout(0.1)
+        self._socket.setblocking(False)
         self._socket.connect((self._options.host, self._options.port))  # receives from this address only
         self._request(_START)
 
     def read(self) -> Reading | None:
-        """Return the next record; None if none arrives within 0.1 s, or if it is not newer than the last."""
-        try:
-            record = self._socket.recv(2 * _RECORD.size)
-        except TimeoutError:
+        """Return the newest record, because older ones wait if the box sends faster than it is read; None if none arrives within 0.1 s,
+        or if it is not newer than the last.
+        """
+        select.select((self._socket,), (), (), 0.1)
+        record = None
+        with contextlib.suppress(OSError):  # no more records, or an ICMP error while the box restarts
+            while True:
+                record = self._socket.recv(2 * _RECORD.size)
+        if record is None:
             self._silent_reads += 1
             if self._silent_reads % _SILENT_READS == 0:
-                self._request(_START)  # the box may have been restarted
+                with contextlib.suppress(OSError):
+                    self._request(_START)  # the box may have been restarted
                 self._sequence = None
             return None
         self._silent_reads = 0

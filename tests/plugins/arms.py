@@ -79,6 +79,11 @@ class ODrives:
         self.states = dict.fromkeys(nodes, 1)
         self.errors = dict.fromkeys(nodes, 0)
         self.silent = False
+        self.answers = 0
+        """Number of answers sent."""
+        self.go_on = threading.Event()
+        """Requests are not answered while it is clear."""
+        self.go_on.set()
         self.ours, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._thread = threading.Thread(target=self._run)
 
@@ -114,4 +119,6 @@ class ODrives:
                 0x15: struct.pack("<ff", 35.0, 42.0),
                 0x1C: struct.pack("<ff", 0.0, self.torques_nm[node]),
             }[command]
+            self.go_on.wait()
             self._theirs.send(frame.pack(identity & 0x7FF, 8, answer))
+            self.answers += 1

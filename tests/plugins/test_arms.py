@@ -340,6 +340,26 @@ def test_an_odrive_that_is_silent_or_has_a_slow_watchdog_is_refused(monkeypatch:
         assert "no answer from nodes [3, 5] within 50 ms" in asyncio.run(refused(odrive()))
 
 
+def test_a_late_answer_of_an_odrive_is_not_taken_for_the_answer_to_a_later_request(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import companion_odrive
+
+    with odrives(monkeypatch) as motors:
+        options = companion_odrive.ODriveOptions(watchdog_timeout_s=0.1, reply_timeout_s=0.3)
+        arm = companion_odrive.ODriveArm(options, odrive(), ODRIVE_ARM.joints)
+        motors.go_on.clear()
+        with pytest.raises(TimeoutError, match=r"no answer from nodes \[3, 5\] within 300 ms"):
+            arm.read()
+        motors.go_on.set()
+        while motors.answers < 2 * 4:  # angle, torque, errors and temperature of each
+            time.sleep(0.001)
+        for nm in (1.0, 2.0, 3.0):
+            arm.write_torque((nm, nm))
+            assert [state.torque_nm for state in arm.read()] == [nm, nm]
+        arm.close()
+
+
 # -- preflight, tools, lists and logs ------------------------------------------------------------------------------------------
 
 

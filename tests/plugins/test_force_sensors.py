@@ -9,7 +9,7 @@ import struct
 import threading
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -325,6 +325,43 @@ async def test_records_of_a_net_ft_box_become_newtons() -> None:
                 pass
             box.sequence -= 100  # records out of order are ignored
             assert driver.counts().bad_sums == 0
+
+
+def test_of_records_that_wait_the_newest_is_read() -> None:
+    import companion_ati
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as box:
+        box.bind(("127.0.0.1", 0))
+        sensor = companion_ati.AtiNetFt(companion_ati.AtiOptions(**ati(box.getsockname()[1]).options), ati(1))
+        sensor.open()
+        _, peer = box.recvfrom(64)
+        for number in range(100):
+            box.sendto(struct.pack(">3I6i", number, 0, 0, number * 1_000_000, 0, 0, 0, 0, 0), peer)
+        assert sensor.read().force_n[0] == 99.0
+        sensor.close()
+
+
+def test_a_box_that_was_restarted_is_read_again() -> None:
+    import companion_ati
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as box:
+        box.bind(("127.0.0.1", 0))
+        address = box.getsockname()
+        sensor = companion_ati.AtiNetFt(companion_ati.AtiOptions(**ati(address[1]).options), ati(1))
+        sensor.open()
+    for _ in range(30):  # nobody listens at its port: the kernel refuses what is sent
+        assert sensor.read() is None
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as box:
+        box.bind(address)
+        box.setblocking(False)
+        peer = None
+        while peer is None:
+            assert sensor.read() is None
+            with suppress(BlockingIOError):
+                _, peer = box.recvfrom(64)
+        box.sendto(struct.pack(">3I6i", 0, 0, 0, 1_000_000, 0, 0, 0, 0, 0), peer)
+        assert sensor.read().force_n[0] == 1.0
+        sensor.close()
 
 
 async def test_a_record_of_the_wrong_size_ends_the_stream() -> None:

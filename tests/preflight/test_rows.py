@@ -258,6 +258,7 @@ CASES = {
     "force port lost": Case("force.device", "was lost", "plug", force_stream(samples=9, lost="was lost")),
     "slow force": Case("force.rate", "150 Hz", "cable", force_stream(samples=750), WARN),
     "very slow force": Case("force.rate", "50 Hz", "cable", force_stream(samples=250)),
+    "too fast force": Case("force.rate", "400 Hz", "devices.force.rate_hz", force_stream(samples=2000)),
     "disturbed": Case("force.checksums", "3 wrong", "shielded", force_stream(bad_sums=3), WARN),
     "noisy": Case("force.noise", "N (one sigma)", "ground", {"force": r.force(noise_n=0.7)}, WARN),
     "very noisy": Case("force.noise", "N (one sigma)", "ground", {"force": r.force(noise_n=5.0)}),
