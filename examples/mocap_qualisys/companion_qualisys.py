@@ -49,7 +49,7 @@ class QualisysTrackManager:
             raise ValueError(f"QTM's z axis must point up, devices.mocap.up_axis is {settings.up_axis}")
         options = QualisysOptions.model_validate(dict(settings.options))
         self._name = options.body_name
-        self._server = (settings.server, options.port)
+        self._server = (socket.gethostbyname(settings.server), options.port)
         self._frames = open_udp(settings.interface)
         self._commands: socket.socket | None = None
         self._ready = False
@@ -80,13 +80,12 @@ class QualisysTrackManager:
         for datagram in waiting(self._frames):
             if datagram.sender_ip != self._server[0]:
                 continue
-            self._due_s = now_s + _RETRY_S
             try:
-                pose = self._pose(datagram.data, arrived_s(datagram.ancillary, lambda: now_s))
+                found.append(self._pose(datagram.data, arrived_s(datagram.ancillary, lambda: now_s)))
             except (struct.error, ValueError) as error:
                 self.problem = f"datagram of {len(datagram.data)} bytes: {error}"
                 continue
-            found.append(pose)
+            self._due_s = now_s + _RETRY_S
         return found
 
     def close(self) -> None:

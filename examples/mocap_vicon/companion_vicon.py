@@ -8,6 +8,7 @@ doubles. Little endian, z up. An object that is not tracked has zeros.
 from __future__ import annotations
 
 import math
+import socket
 import struct
 
 from companion.config.base import Model
@@ -41,7 +42,7 @@ class ViconTracker:
             raise ValueError(f"Vicon Tracker streams z up, devices.mocap.up_axis is {settings.up_axis}")
         options = ViconOptions.model_validate(dict(settings.options))
         self._name = options.object_name.encode()
-        self._server = settings.server
+        self._server = socket.gethostbyname(settings.server)
         self._broadcasts = open_udp(
             "", options.port, shared=True
         )  # the flight and the guardian both receive a broadcast

@@ -77,9 +77,10 @@ def until(tracker: Any, holds: Callable[[list[MocapPose]], bool]) -> list[MocapP
     raise AssertionError(f"not within {DEADLINE_S:g} s; problem: {tracker.problem}")
 
 
-def test_it_keeps_the_contract() -> None:
+@pytest.mark.parametrize("server", ["127.0.0.1", "localhost"])
+def test_it_keeps_the_contract(server: str) -> None:
     with streaming(WAND, QUAD) as qtm:
-        check_mocap(device(qtm.port), duration_s=0.3)
+        check_mocap(device(qtm.port, server=server), duration_s=0.3)
     assert any(command.startswith("StreamFrames AllFrames UDP:") for command in qtm.commands)
 
 
@@ -131,6 +132,8 @@ def test_a_body_that_is_added_in_front_is_not_taken_for_the_vehicle() -> None:
         qtm.bodies.insert(0, WAND)
         until(tracker, lambda _: tracker.problem is not None)
         assert "2 bodies, but QTM has named 1" in tracker.problem
+        poses = until(tracker, bool)  # the names are requested again
+        assert all(pose.position_world_m[0] == pytest.approx(-1.25) for pose in poses)
         tracker.close()
 
 

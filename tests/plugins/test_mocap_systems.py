@@ -57,9 +57,9 @@ def installed(tmp_path: Path) -> Iterator[None]:
         yield
 
 
-def vicon(port: int) -> MocapDevice:
+def vicon(port: int, server: str = "127.0.0.1") -> MocapDevice:
     options: dict[str, JsonValue] = {"object_name": "quad", "port": port}
-    return MocapDevice(type="vicon", server="127.0.0.1", interface="127.0.0.1", rigid_body_id=1, options=options)
+    return MocapDevice(type="vicon", server=server, interface="127.0.0.1", rigid_body_id=1, options=options)
 
 
 def datagram(number: int, *objects: tuple[str, tuple[float, ...]]) -> bytes:
@@ -105,9 +105,10 @@ def check_pose(pose: MocapPose) -> None:
     assert pose.tracking_valid
 
 
-async def test_flight_and_guardian_receive_the_same_poses() -> None:
+@pytest.mark.parametrize("server", ["127.0.0.1", "localhost"])
+async def test_flight_and_guardian_receive_the_same_poses(server: str) -> None:
     port, clock = free_udp_port(), flight_clock()
-    device = vicon(port)
+    device = vicon(port, server)
     poses: list[MocapPose] = []
     client = GuardianMocap(settings_of(device), lambda: 100.0)
     with broadcasting(port, STRANGER, QUAD):
