@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
@@ -19,6 +18,7 @@ from companion.io.mocap.natnet import Message
 from companion.model.algebra import plus
 from companion.model.frames import quat_rotate
 from companion.model.types import Quat, Vec3
+from companion.runtime.clock import monotonic
 
 CLOCK_FREQUENCY_HZ: Final = 10_000_000
 """Frequency of the Windows performance counter, as Motive reports it."""
@@ -83,7 +83,7 @@ class NatNetServer:
         data_port: int = 0,
         multicast_group: str | None = None,
         bodies: Sequence[tuple[int, str]] = ((1, "companion"),),
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = monotonic,
         stamps: Callable[[], float] | None = None,
     ) -> None:
         self._clock = clock

@@ -9,12 +9,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
-import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from typing import Any
 
 from companion.model.launcher_messages import WorldEvent, WorldSlipped
 from companion.model.types import IDENTITY_QUAT
+from companion.runtime.clock import monotonic
 from sitl.lockstep import CATCH_UP_S, LockstepLoop, TimeKeeper
 from sitl.mocap import MocapFrame
 from sitl.natnet import OTHER_BODY, OTHER_PLACE_M, BodyPose, NatNetServer
@@ -138,7 +138,7 @@ class Sitl:
 
     def _server_clock_s(self) -> float:
         """Return the clock of the motion-capture server, with which `_publish` stamps frames."""
-        now_s = self._t_s if self._keeper is not None else time.monotonic() - self._origin_s
+        now_s = self._t_s if self._keeper is not None else monotonic() - self._origin_s
         return self.machines[0].faults.server_clock_s(now_s) + self._ahead_s
 
     @property
@@ -214,9 +214,9 @@ class Sitl:
                     before_s = before_s if self._scene is scene else 0.0
 
     async def _follow_clock(self) -> None:
-        origin_s = self._origin_s = time.monotonic() - self._t_s
+        origin_s = self._origin_s = monotonic() - self._t_s
         while not self._ends:
-            behind_s = time.monotonic() - origin_s - self._t_s
+            behind_s = monotonic() - origin_s - self._t_s
             if behind_s > CATCH_UP_S:
                 origin_s = self._origin_s = origin_s + behind_s - CATCH_UP_S
                 self.slipped_s += behind_s - CATCH_UP_S
@@ -231,7 +231,7 @@ class Sitl:
             for _ in range(int(behind_s / PHYSICS_DT_S)):
                 await self._answered()
                 self._step()
-            ahead_s = self._t_s + PHYSICS_DT_S - (time.monotonic() - origin_s)
+            ahead_s = self._t_s + PHYSICS_DT_S - (monotonic() - origin_s)
             await asyncio.sleep(max(0.0, ahead_s))
 
     def _step(self) -> None:

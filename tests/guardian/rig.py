@@ -29,6 +29,7 @@ from companion.model.frames import attitude_ned_frd_from_enu_flu, ned_from_enu
 from companion.model.launcher_messages import FlightEvent, GuardianEnded, Message
 from companion.model.packets import LogLine, Packet, read_packet
 from companion.model.types import Quat, Vec3
+from companion.runtime.clock import monotonic
 from sitl.natnet import BodyPose, NatNetServer
 from tests.io.px4_peer import Px4Peer
 from tests.support import DEADLINE_S, HOVER, free_udp_port, wait_until
@@ -87,7 +88,7 @@ class Cameras:
             self.port = server.command_port
             self._started.set()
             while not self._stop.is_set():
-                now_s = time.monotonic()
+                now_s = monotonic()
                 x, y, z = self.position_m
                 noisy = (x, y, z + 1e-6 * (server.frame_number % 5))  # no measurement is the same twice
                 server.publish(now_s, (BodyPose(self._body_id, noisy, self.attitude, self.tracked),), now_s)
@@ -118,7 +119,7 @@ class Rig:
         self.peer.landed = mavlink.MAV_LANDED_STATE_IN_AIR
         self.peer.position_ned_m, self.peer.velocity_ned_m_s = ned_from_enu(POSITION_M), (0.0, 0.0, 0.0)
         self.peer.attitude_ned_frd = attitude_ned_frd_from_enu_flu(ATTITUDE)
-        self.origin_s = time.monotonic() - 10.0
+        self.origin_s = monotonic() - 10.0
         self.tick = 0
         self.messages: list[Message] = []
         self._disk_full = disk_full
@@ -203,7 +204,7 @@ class Rig:
     ) -> None:
         """Send the heartbeat of one tick."""
         self.tick += 1
-        t_s = time.monotonic() - self.origin_s
+        t_s = monotonic() - self.origin_s
         beat = Heartbeat(
             tick=self.tick,
             t_s=t_s,

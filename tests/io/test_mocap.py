@@ -9,7 +9,6 @@ import asyncio
 import dataclasses
 import logging
 import socket
-import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, closing
 from typing import Any, Literal
@@ -22,7 +21,7 @@ from companion.io.mocap.driver import MocapDriver
 from companion.io.mocap.natnet import Message
 from companion.io.protocols import Mocap
 from companion.model.types import MocapPose, Vec3
-from companion.runtime.clock import flight_clock
+from companion.runtime.clock import flight_clock, monotonic
 from sitl.natnet import BodyPose, NatNetServer
 from tests.io.natnet_bytes import LATER, VERSIONS
 from tests.io.refusal import refusal
@@ -55,7 +54,7 @@ async def streaming(
 
     async def publish() -> None:
         while True:
-            t_s = time.monotonic() - held_s
+            t_s = monotonic() - held_s
             server.publish(t_s, poses, t_s - 0.004, single)
             await asyncio.sleep(0.005)
 
