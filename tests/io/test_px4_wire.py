@@ -158,7 +158,16 @@ def test_a_serial_port_that_px4_does_not_drain_holds_nobody_up() -> None:
             taken += 1
             assert taken < 100_000, "the line takes everything"
         assert taken > 0
-        assert not wire.send(heartbeat())
+
+
+def test_what_waits_in_a_serial_port_that_px4_does_not_read_is_dropped() -> None:
+    """PX4 that restarts under flow control must not receive a request to arm that was withdrawn long ago."""
+    with serial_line() as (px4, port), opened(f"serial://{port}:57600") as wire:
+        assert wire.send(bytes(8192))  # the far end of a pseudo-terminal has 4 kB of its own
+        assert wire.send(b"arm")
+        while wire.send(heartbeat()):
+            pass
+        assert wire.send(heartbeat()) and b"arm" not in os.read(px4, 1_000_000)
 
 
 def test_a_serial_port_that_another_process_holds_is_not_opened() -> None:
@@ -192,3 +201,29 @@ def test_a_tcp_connection_that_ends_is_lost() -> None:
         wait_readable(wire)
         assert (wire.receive(), wire.lost) == ([], True)
         wire.send(b"into the void")
+
+
+def test_a_tcp_connection_that_delivers_nothing_is_lost_with_what_waits_in_it() -> None:
+    with socket.socket() as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        server.bind(("127.0.0.1", 0))
+        server.listen()
+        with opened(f"tcpout://127.0.0.1:{server.getsockname()[1]}") as wire:
+            connection, _ = server.accept()
+            with connection:
+
+                def lost() -> bool:
+                    while wire.send(heartbeat()):
+                        pass
+                    return wire.receive() == [] and wire.lost
+
+                wait_until(lost, lambda: "the connection is not lost")
+
+
+def test_no_message_on_a_tcp_connection_waits_for_the_answer_to_the_one_before() -> None:
+    with (
+        closing(socket.create_server(("127.0.0.1", 0))) as server,
+        opened(f"tcpout://127.0.0.1:{server.getsockname()[1]}") as wire,
+        socket.socket(fileno=os.dup(wire.fileno())) as shared,
+    ):
+        assert shared.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)

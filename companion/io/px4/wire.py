@@ -8,6 +8,7 @@ import errno
 import logging
 import os
 import socket
+import termios
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -22,6 +23,8 @@ _MAX_BYTES = 65535
 ROUND_DATAGRAMS = 200
 """Most datagrams read in one call, so that a flood from PX4's own address does not hold up a tick; PX4 sends some 600 per second."""
 _CONNECT_TIMEOUT_S = 0.5
+_UNSENT_MAX_S = 0.5
+"""Time after which a TCP connection that delivers nothing ends, and with it what waits to be sent."""
 REPIN_SILENCE_S = 1.0
 """Silence after which PX4 is looked for at other ports of its address; PX4 sends hundreds of datagrams per second."""
 _ANY_PEER = bytes(16)
@@ -184,11 +187,15 @@ def _disconnect(connected: socket.socket) -> None:
 
 
 class TcpWire(_ChannelWire):
-    """TCP client transport."""
+    """TCP client transport. A connection that is interrupted is lost after `_UNSENT_MAX_S`: TCP would deliver all that was sent
+    meanwhile once the network is back, such as an old request to arm. No message waits for others to share a packet with.
+    """
 
     def __init__(self, remote: tuple[str, int], clock: Clock) -> None:
         self._socket = socket.create_connection(remote, _CONNECT_TIMEOUT_S)
         super().__init__(self._socket, clock)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(_UNSENT_MAX_S * 1e3))
         self._socket.setblocking(False)
 
     def send(self, data: bytes) -> bool:
@@ -222,9 +229,15 @@ class SerialWire(_ChannelWire):
         super().__init__(self._port, clock)
 
     def send(self, data: bytes) -> bool:
-        """Write as many bytes as the port accepts, without waiting; pyserial's `write` would retry for ever while PX4 does not read."""
-        with contextlib.suppress(OSError):
-            return os.write(self._port.fileno(), data) == len(data)
+        """Write as many bytes as the port accepts, without waiting; pyserial's `write` would retry for ever while PX4 does not read.
+
+        Once the port accepts no more, all that waits in it is dropped: PX4 must not receive it when it reads again.
+        """
+        with contextlib.suppress(OSError, termios.error):
+            with contextlib.suppress(BlockingIOError):
+                if os.write(self._port.fileno(), data) == len(data):
+                    return True
+            termios.tcflush(self._port.fileno(), termios.TCOFLUSH)
         return False
 
     def receive(self) -> list[tuple[float, bytes]]:
