@@ -1,7 +1,8 @@
 """An arm on ODrive motor controllers (firmware 0.6) over CAN. It has not been tried with a real ODrive yet.
 
-CANSimple protocol: the id of a frame is node << 5 | command, and a remote frame asks for a value. Little endian. Angles are turns and
-torques N m of the motor; `gear_ratio` relates them to the output shaft.
+CANSimple protocol: the id of a frame is node << 5 | command, and a remote frame asks for a value (Get_*); an axis state comes only in
+HEARTBEAT, which every ODrive sends by itself (`axis0.config.can.heartbeat_msg_rate_ms`, 100 by default). Little endian. Angles are
+turns and torques N m of the motor; `gear_ratio` relates them to the output shaft.
 """
 
 from __future__ import annotations
@@ -60,6 +61,8 @@ class ODriveArm:
         self._reply_timeout_s = options.reply_timeout_s
         self._cycle = 0
         self._temperatures_c: list[float] = [0.0] * len(joints)
+        self._states: dict[int, int] = {}
+        """Axis state in the newest HEARTBEAT of each node."""
         self._can = can_socket(options.channel)
 
     def open(self) -> None:
@@ -72,10 +75,11 @@ class ODriveArm:
             self._send(node, TORQUE, struct.pack("<f", 0.0))
             self._send(node, STATE, struct.pack("<I", CLOSED_LOOP))
         deadline_s = time.monotonic() + _START_TIMEOUT_S
-        while states := {data[4] for (data,) in self._ask([HEARTBEAT])} - {CLOSED_LOOP}:
+        while states := {self._states.get(node) for node in self._nodes} - {CLOSED_LOOP}:
             if time.monotonic() > deadline_s:
                 raise RuntimeError(f"axis states {states}, expected {CLOSED_LOOP} (closed loop); odrivetool shows why")
             self.write_torque([0.0] * len(self._nodes))  # feeds the watchdogs
+            self._ask([ERROR])
 
     def read(self) -> list[MotorState]:
         """Ask every ODrive for angle, rate, torque and errors, and now and then for its temperature."""
@@ -117,14 +121,21 @@ class ODriveArm:
     def _send(self, node: int, command: int, data: bytes = b"", remote: int = 0) -> None:
         self._can.send(FRAME.pack(node << 5 | command | remote, 8 if remote else len(data), data))
 
+    def _receive(self) -> tuple[int, int, bytes]:
+        """Return id, size and data of the next frame."""
+        identity, size, data = FRAME.unpack(self._can.recv(FRAME.size))
+        if identity & 0x1F == HEARTBEAT and not identity & REMOTE:
+            self._states[identity >> 5] = data[4]
+        return identity, size, data
+
     def _ask(self, commands: Sequence[int], timeout_s: float = 0.0) -> list[list[bytes]]:
         """Ask every node for these values; return its answers in the order of the nodes and commands. Frames that have arrived before
         are dropped: late answers, which would be taken for new ones in this and every later cycle, and cyclic messages.
         """
         self._can.setblocking(False)
         with contextlib.suppress(BlockingIOError):
-            while self._can.recv(FRAME.size):
-                pass
+            while True:
+                self._receive()
         wanted = [node << 5 | command for node in self._nodes for command in commands]
         for node in self._nodes:
             for command in commands:
@@ -135,7 +146,7 @@ class ODriveArm:
         while not answers.keys() >= set(wanted):
             self._can.settimeout(max(1e-6, deadline_s - time.monotonic()))
             try:
-                identity, size, data = FRAME.unpack(self._can.recv(FRAME.size))
+                identity, size, data = self._receive()
             except TimeoutError:
                 silent = sorted({identity >> 5 for identity in set(wanted) - answers.keys()})
                 raise TimeoutError(f"no answer from nodes {silent} within {1e3 * timeout_s:g} ms") from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 import threading
+import time
 
 SCRIPTED = '''
 import math, time
@@ -92,14 +93,19 @@ class ODrives:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.ours.close()
         self._theirs.shutdown(socket.SHUT_RDWR)
         self._thread.join()
         self._theirs.close()
+        self.ours.close()
 
     def _run(self) -> None:
         frame = struct.Struct("<IB3x8s")
+        beat_s = 0.0
         while received := self._theirs.recv(64):
+            if time.monotonic() >= beat_s and not self.silent:
+                beat_s = time.monotonic() + 0.01
+                for number, state in self.states.items():
+                    self._theirs.send(frame.pack(number << 5 | 0x01, 8, struct.pack("<IB3x", 0, state)))
             identity, size, data = frame.unpack(received)
             node, command = (identity & 0x7FF) >> 5, identity & 0x1F
             if node not in self.torques_nm or self.silent:
@@ -113,7 +119,6 @@ class ODrives:
                 continue
             answer = {
                 0x00: bytes((2, 4, 4, 58, 0, 6, 10, 0)),
-                0x01: struct.pack("<IB3x", 0, self.states[node]),
                 0x03: struct.pack("<II", self.errors[node], 0),
                 0x09: struct.pack("<ff", 0.25 * node, 0.5),
                 0x15: struct.pack("<ff", 35.0, 42.0),
