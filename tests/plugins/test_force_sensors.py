@@ -167,6 +167,15 @@ def ati(port: int) -> ForceDevice:
     return ForceDevice(type="ati", rate_hz=500, options=options)
 
 
+def ati_sensor(port: int) -> Any:
+    """Return the example's sensor, opened without the driver."""
+    import companion_ati
+
+    sensor = companion_ati.AtiNetFt(companion_ati.AtiOptions.model_validate(ati(port).options), ati(port))
+    sensor.open()
+    return sensor
+
+
 @contextmanager
 def rft60() -> Iterator[ForceDevice]:
     """The simulated world's sensor with noise, in a thread with an event loop of its own."""
@@ -328,12 +337,9 @@ async def test_records_of_a_net_ft_box_become_newtons() -> None:
 
 
 def test_of_records_that_wait_the_newest_is_read() -> None:
-    import companion_ati
-
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as box:
         box.bind(("127.0.0.1", 0))
-        sensor = companion_ati.AtiNetFt(companion_ati.AtiOptions(**ati(box.getsockname()[1]).options), ati(1))
-        sensor.open()
+        sensor = ati_sensor(box.getsockname()[1])
         _, peer = box.recvfrom(64)
         for number in range(100):
             box.sendto(struct.pack(">3I6i", number, 0, 0, number * 1_000_000, 0, 0, 0, 0, 0), peer)
@@ -342,13 +348,10 @@ def test_of_records_that_wait_the_newest_is_read() -> None:
 
 
 def test_a_box_that_was_restarted_is_read_again() -> None:
-    import companion_ati
-
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as box:
         box.bind(("127.0.0.1", 0))
         address = box.getsockname()
-        sensor = companion_ati.AtiNetFt(companion_ati.AtiOptions(**ati(address[1]).options), ati(1))
-        sensor.open()
+        sensor = ati_sensor(address[1])
     for _ in range(30):  # nobody listens at its port: the kernel refuses what is sent
         assert sensor.read() is None
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as box:
