@@ -6,7 +6,6 @@ import asyncio
 import itertools
 import math
 import threading
-import time
 
 from companion.config import device_plugins
 from companion.config.devices import MocapDevice
@@ -14,7 +13,7 @@ from companion.guardian.mocap import GuardianMocap
 from companion.io.mocap.driver import MocapDriver, settings_of
 from companion.model.types import MocapPose
 from companion.plugins import MOCAP_SYSTEMS
-from companion.runtime.clock import flight_clock
+from companion.runtime.clock import flight_clock, monotonic
 
 FIRST_POSE_S = 5.0
 """Timeout of the guardian's first tracked pose."""
@@ -48,7 +47,7 @@ async def _both_clients(device: MocapDevice, duration_s: float) -> None:
     before, clock = set(threading.enumerate()), flight_clock()
     poses: list[MocapPose] = []
     seen: list[MocapPose] = []
-    guardian, origin_s = GuardianMocap(settings_of(device)), time.monotonic() - _GUARDIAN_START_S
+    guardian, origin_s = GuardianMocap(settings_of(device)), monotonic() - _GUARDIAN_START_S
     try:
         async with MocapDriver(device, clock, poses.append) as driver:
             deadline_s, ends_s = clock() + FIRST_POSE_S, clock() + duration_s
@@ -62,7 +61,7 @@ async def _both_clients(device: MocapDevice, duration_s: float) -> None:
             assert server is not None and server.name and server.name.isprintable(), f"server_name: {server}"
             assert not counts.malformed, f"{counts.malformed} malformed datagrams: {counts.problem}"
             assert counts.callback_error is None, counts.callback_error
-            ended_s, guardian_s = clock(), time.monotonic() - origin_s
+            ended_s, guardian_s = clock(), monotonic() - origin_s
     finally:
         guardian.close()
     _check(poses, "flight")
