@@ -404,6 +404,8 @@ def _mcap_records(path: Path) -> Iterator[Any]:
     """Iterate over the records of the file in order. An unclosed file ends without an error."""
     try:
         file = path.open("rb")
+    except IsADirectoryError:
+        raise LogError(f"{path}: is a folder; expected a flight log, such as {path / 'flight.mcap'}") from None
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     with file:

@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         shutil.copytree(FILES, folder, copy_function=shutil.copyfile)
     except OSError as error:
-        raise ConfigError(f"companion init: {folder}: cannot be written: {error}") from None
+        raise ConfigError(f"companion init: {folder}: cannot be written: {error.strerror or error}") from None
     print(f"{folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
     line = shlex.join(["companion", "fly", f"{folder / 'missions' / DEFAULT_MISSION}.yaml", "--sitl"])
     print(f"try: {line}")

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from companion import __version__
-from companion.runtime.subprocesses import use_default_signals
+from companion.runtime.subprocesses import prepare_streams, use_default_signals
 
 _OF_FLIGHT = ("fly", "check", "schema", "sitl", "replay")
 """Commands whose parsers are in `companion.cli.flight`."""
@@ -48,6 +48,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `companion`."""
+    prepare_streams()
     use_default_signals()
     words = _normalised(list(sys.argv[1:] if argv is None else argv))
     arguments, unknown = make_parser(words[:1]).parse_known_args(words)

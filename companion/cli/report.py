@@ -178,6 +178,8 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
         for name, text in contact_lines(flight.summary):
             print(f"{name}: {text}")
         print(report)
+        if arguments.gif is not None:
+            print(arguments.gif)
     return EXIT_OK
 
 
@@ -194,7 +196,7 @@ def _write_gif(flight: Graded, path: Path) -> None:
     try:
         write_gif(movie, path)
     except (OSError, ValueError) as error:
-        raise _refusal(f"{path}: cannot be written: {error}") from None
+        raise _refusal(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
 
 
 # Several flights

@@ -5,6 +5,7 @@ Through the command's entry point, in this process; a few of each sort as a user
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import socket
@@ -137,6 +138,14 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("report", "a.mcap", "b.mcap", "--gif", "catch.gif"),
         (r"^companion report: --gif: expected one log, got 2$",),
     ),
+    "folder of a flight in place of its log": (
+        ("replay", "."),
+        (r"^\.: is a folder; expected a flight log, such as flight\.mcap$",),
+    ),
+    "copies where nothing can be written": (
+        ("init", "/proc/configs"),
+        (r"^companion init: /proc/configs: cannot be written: No such file or directory$",),
+    ),
     "schema of nothing": (("schema", "moon"), (r"^companion schema: .*'moon'.*'mission'",)),
     "a world of a bad mission": (("sitl", "nofile.yaml"), (r"^nofile\.yaml: no such file$",)),
 }
@@ -242,3 +251,28 @@ def test_output_that_cannot_be_written_is_one_line(command: str, tmp_path: Path)
     assert ended.stderr.splitlines() == [
         f"companion {name}: standard output cannot be written: No space left on device"
     ]
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_standard_stream_that_is_closed_is_as_the_null_device(sandbox: Sandbox, closed: str) -> None:
+    companion = f"{shlex.quote(sys.executable)} -P -m companion"
+    good, bad = (
+        subprocess.run(
+            ["sh", "-c", f"{companion} check --plan-only {mission} {closed}"],
+            capture_output=True, text=True, cwd=sandbox.cwd, env=sandbox.environment,
+        )
+        for mission in ("mission.yaml", "none.yaml")
+    )  # fmt: skip
+    assert (good.returncode, good.stderr) == (EXIT_OK, "")
+    assert good.stdout.startswith("mission.yaml: ") is (" >&-" not in f" {closed}")
+    assert (bad.returncode, bad.stdout) == (EXIT_BAD_INPUT, "")
+    assert bad.stderr == ("" if "2>&-" in closed else "none.yaml: no such file\n")
+
+
+def test_characters_that_the_encoding_of_standard_output_lacks_are_escaped(tmp_path: Path) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-P", "-m", "companion", "init", "Fläche"],
+        capture_output=True, text=True, cwd=tmp_path, env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )  # fmt: skip
+    assert (ended.returncode, ended.stderr) == (EXIT_OK, "")
+    assert ended.stdout.startswith(r"Fl\xe4che: controllers, ")
