@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import fcntl
+import itertools
+import os
 import shlex
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -154,19 +157,67 @@ def results_folder(arguments: argparse.Namespace, parent: str, result: str | Non
     Raises:
         ConfigError: the folder cannot be used.
     """
-    folder = Path(arguments.out) if arguments.out is not None else Path(parent) / time_stamp()
-    empty_name = "expected the name of a folder, got an empty one" if arguments.out == "" else None
-    problem = empty_name or why_unusable(folder, result)
-    if problem is not None:
-        raise ConfigError(f"companion {arguments.command}: --out {folder}: {problem}")
+    with reserved_folder(arguments.command, arguments.out, Path(parent) / time_stamp(), result) as folder:
+        try:
+            yield folder
+        finally:
+            # Removes empty folders only.
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+                if arguments.out is None:
+                    folder.parent.rmdir()
+
+
+@contextlib.contextmanager
+def reserved_folder(command: str, given: str | None, default: Path, result: str | None) -> Iterator[Path]:
+    """Yield the folder `given`, or a new one with the name `default`. Until the block ends, no other command can reserve it.
+
+    Args:
+        result: as for `why_unusable`.
+
+    Raises:
+        ConfigError: the folder cannot be used.
+    """
+    if given is not None and not given.strip():
+        raise ConfigError(f"companion {command}: --out: expected the name of a folder, got an empty one")
+    folder = _new(default) if given is None else Path(given)
+    problem = why_unusable(folder, result)
+    if problem is None:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            if _locked(descriptor):
+                yield folder
+                return
+        finally:
+            os.close(descriptor)
+        problem = "another command writes to it now; choose another folder"
+    raise ConfigError(f"companion {command}: --out {folder}: {problem}")
+
+
+def _new(folder: Path) -> Path:
+    """Create a folder, with a number after its name if it exists. Return its path, also if it cannot be created."""
+    path = folder
+    for number in itertools.count(2):
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            path = folder.with_name(f"{folder.name}-{number}")
+        except OSError:
+            break
+        else:
+            break
+    return path
+
+
+def _locked(descriptor: int) -> bool:
+    """Lock a folder without waiting. Return False if another process has locked it; a file system without locks never refuses."""
     try:
-        yield folder
-    finally:
-        # Removes empty folders only.
-        with contextlib.suppress(OSError):
-            folder.rmdir()
-            if arguments.out is None:
-                folder.parent.rmdir()
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 def wide_console(width: int = PIPED_WIDTH) -> Console:

@@ -159,7 +159,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _fly(arguments: argparse.Namespace) -> int:
-    from companion.cli.campaign import why_unusable
+    from companion.cli.campaign import reserved_folder
     from companion.launcher.run import run_flight
 
     if arguments.sitl not in (None, "stub", "px4"):
@@ -167,9 +167,6 @@ def _fly(arguments: argparse.Namespace) -> int:
         return EXIT_BAD_INPUT
     speed = speed_of(arguments)
     if speed is not None and not speed > 0.0:
-        return EXIT_BAD_INPUT
-    if arguments.out is not None and not arguments.out.strip():
-        print_error("companion fly: --out: expected the name of a folder, got an empty one")
         return EXIT_BAD_INPUT
     if arguments.mqtt is not None:
         off, url = arguments.mqtt == "off", json.dumps(arguments.mqtt)
@@ -189,14 +186,11 @@ def _fly(arguments: argparse.Namespace) -> int:
         for line in problems:
             print_error(line)
         return EXIT_BAD_INPUT
-    out = Path(arguments.out) if arguments.out else Path("flights") / f"{time_stamp()}-{config.mission.name}"
-    problem = why_unusable(out, "flight.mcap")
-    if problem is not None:
-        print_error(f"companion fly: --out {out}: {problem}")
-        return EXIT_BAD_INPUT
-    return run_flight(
-        config, out, sitl=arguments.sitl, console=terminal_console(), report=not arguments.no_report, speed=speed
-    )
+    default = Path("flights") / f"{time_stamp()}-{config.mission.name}"
+    with reserved_folder("fly", arguments.out, default, "flight.mcap") as out:
+        return run_flight(
+            config, out, sitl=arguments.sitl, console=terminal_console(), report=not arguments.no_report, speed=speed
+        )
 
 
 def speed_of(arguments: argparse.Namespace) -> float | None:

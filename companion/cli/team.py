@@ -85,7 +85,7 @@ def _loaded(arguments: argparse.Namespace) -> TeamConfig:
 
 
 def _fly(arguments: argparse.Namespace) -> int:
-    from companion.cli.campaign import why_unusable
+    from companion.cli.campaign import reserved_folder
     from companion.launcher.team import run_team
 
     if arguments.sitl is None:
@@ -111,13 +111,10 @@ def _fly(arguments: argparse.Namespace) -> int:
         problems.append(f"{team.source}: {text}: --set right.vehicle.ground.foxglove=127.0.0.1:8766")
     if problems:
         raise ConfigError(problems)
-    out = Path(arguments.out) if arguments.out else Path("flights") / f"{time_stamp()}-{team.name}"
-    problem = why_unusable(out, "summary.json")
-    if problem is not None:
-        print_error(f"companion team fly: --out {out}: {problem}")
-        return EXIT_BAD_INPUT
     console, px4 = terminal_console(), arguments.sitl == "px4"
-    return run_team(team, out, console=console, report=not arguments.no_report, speed=speed, px4=px4)
+    default = Path("flights") / f"{time_stamp()}-{team.name}"
+    with reserved_folder("team fly", arguments.out, default, "summary.json") as out:
+        return run_team(team, out, console=console, report=not arguments.no_report, speed=speed, px4=px4)
 
 
 def _check(arguments: argparse.Namespace) -> int:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.cli.campaign import reserved_folder
 from companion.cli.main import main
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from tests.analysis.synthetic_flight import record_flight
@@ -207,6 +208,23 @@ def test_a_folder_that_holds_a_flight_is_not_touched(sandbox: Sandbox, companion
     (sandbox.cwd / "out").mkdir()
     (sandbox.cwd / "out/flight.mcap").write_bytes(b"an earlier flight")
     assert_refused(sandbox, companion, FLY, (r"--out out: already contains flight\.mcap; choose another folder",))
+
+
+def test_a_folder_of_a_flight_in_progress_is_refused(sandbox: Sandbox, companion: Command) -> None:
+    with reserved_folder("fly", "out", Path("new"), "flight.mcap"):
+        refusal = (r"^companion fly: --out out: another command writes to it now; choose another folder$",)
+        assert_refused(sandbox, companion, (*FLY, "--out", "out"), refusal)
+
+
+def test_flights_that_begin_in_the_same_second_have_folders_of_their_own(tmp_path: Path) -> None:
+    default = tmp_path / "flights" / "20261125-093743-catch"
+    with (
+        reserved_folder("fly", None, default, "flight.mcap") as first,
+        reserved_folder("fly", None, default, "flight.mcap") as second,
+    ):
+        assert (first.name, second.name) == ("20261125-093743-catch", "20261125-093743-catch-2")
+    with reserved_folder("fly", str(first), default, "flight.mcap"):
+        pass
 
 
 def test_the_good_files_that_the_bad_ones_are_made_of_pass(sandbox: Sandbox) -> None:
