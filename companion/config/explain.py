@@ -30,6 +30,8 @@ _UNITS = {
     "ma": "mA", "mv": "mV",
 }  # fmt: skip
 """Units by key suffix, including units that no key uses."""
+_KINDS = {"phases": "mission", "airframe": "vehicle", "law": "controller", "members": "team", "extends": "world"}
+"""Kind of the file that has a key at its top level; no two kinds share one of these keys."""
 MANY_OPTIONS = 12
 """Largest number of options that a message lists in full."""
 
@@ -77,12 +79,16 @@ def _found(model: type[Model], document: Document, error: ValidationError | None
 def _problems(error: ValidationError, schema: _Node, document: Document) -> list[Problem]:
     problems: list[Problem] = []
     meant: set[Location] = set()
+    listed: set[Location] = set()
+    kind = _another_kind(schema, document)
+    if kind is not None:
+        return [Problem(RANK_KEY, Origin(document.source), kind)]
     reported: set[Location] = set()
     missing: list[tuple[Location, str]] = []
     for detail in error.errors(include_url=False):
         at, node, parent = _walk(schema, detail["loc"])
         if detail["type"] == "extra_forbidden":
-            text, instead = _unknown(at, parent, document)
+            text, instead = _unknown(at, parent, document, listed)
             problems.append(problem(RANK_KEY, document.key_origin(at), at, text))
             if instead is not None:
                 meant.add((*at[:-1], instead))
@@ -189,8 +195,22 @@ def _plural(item: str) -> str:
     return re.sub(r"^(?:a|an) ((?:whole )?number)", r"\1s", item)
 
 
-def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[str, str | None]:
-    """Return the message about an unknown key, and the known key that was probably meant or None."""
+def _another_kind(schema: _Node, document: Document) -> str | None:
+    """Return the message about a file of another kind than expected, or None."""
+    known = schema.get("properties", {})
+    marks = [key for key in _KINDS if key in known]
+    found = [key for key in _KINDS if key in document.data and key not in known]
+    if not marks or not found or marks[0] in document.data:
+        return None
+    return f"is a {_KINDS[found[0]]} file, expected a {_KINDS[marks[0]]} file"
+
+
+def _unknown(at: Location, parent: _Node | None, document: Document, listed: set[Location]) -> tuple[str, str | None]:
+    """Return the message about an unknown key, and the known key that was probably meant or None.
+
+    Args:
+        listed: locations of the mappings whose known keys an earlier message has listed.
+    """
     key = str(at[-1])
     known = list((parent or {}).get("properties", {}))
     stem, unit = split_unit(key, _UNITS)
@@ -200,11 +220,16 @@ def _unknown(at: Location, parent: _Node | None, document: Document) -> tuple[st
             here = f", in {_UNITS[candidate_unit]}"
             what = f"not in {_UNITS[unit]}" if unit is not None else "without a unit"
             return f"unknown key; write {candidate}{here} ({what})", candidate
-    close = nearest(key, known)
+    parts = [name for name in known if key.lower() in name.split("_")]
+    close = nearest(key, known) or (parts[0] if len(parts) == 1 else None)
     if close is not None:
         return f"unknown key; did you mean {close}?", close
+    if at[:-1] in listed:
+        return "unknown key", None
+    listed.add(at[:-1])
     given = document.find(at[:-1])
-    free = [name for name in known if not (isinstance(given, dict) and name in given)]
+    in_file = document.key_origin(at).line > 0  # an override may name a key that the file has
+    free = [name for name in known if not (in_file and isinstance(given, dict) and name in given)]
     return f"unknown key; known keys: {', '.join(free or known)}", None
 
 

@@ -26,7 +26,7 @@ from companion.config.explain import did_you_mean, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
 from companion.config.phase import phase_classes
-from companion.config.shipped import named_file, near
+from companion.config.shipped import named_file, names, near
 from companion.config.urdf import read_urdf
 from companion.config.vehicle import Vehicle
 from companion.config.yaml_strict import read_document
@@ -237,8 +237,8 @@ def _place_arm(document: Document, vehicle: Vehicle | None) -> None:
             poses_deg = vehicle.poses_deg if vehicle is not None else {given: ()}
             if given not in poses_deg:
                 if vehicle is not None and vehicle.arm.joints:
-                    text = f'expected joint angles or a pose of the vehicle ({", ".join(poses_deg)}), got "{given}"; '
-                    text += "define it in arm.poses of the vehicle file"
+                    text = f'expected joint angles or a pose of the vehicle ({", ".join(poses_deg)}), got "{given}"'
+                    text += did_you_mean(given, list(poses_deg)) or "; define it in arm.poses of the vehicle file"
                 else:
                     text = f'the mission moves the arm to "{given}", but the vehicle has no arm; choose a mission without arm '
                     text += "motion, such as hover, or a vehicle with an arm"
@@ -287,7 +287,7 @@ def _open_named(
     """Read the file `given` or, if that is None, the file that the mission names, relative to the mission file. A vehicle
     may be named as `--vehicle` names it.
     """
-    where = ""
+    where = hint = ""
     try:
         if given is not None:
             return read_document(named_file("vehicles", given, "--vehicle"))
@@ -300,9 +300,11 @@ def _open_named(
         path = base / named
         if location == ("vehicle",) and not path.suffix and not path.exists():
             path = named_file("vehicles", named)
+        elif location == ("vehicle",) and path.stem in names("vehicles") and not path.exists():
+            hint = f"; the shipped file is named without a path: vehicle: {path.stem}"
         return read(os.path.normpath(path))
     except ConfigError as error:
-        lines += [where + line for line in error.lines]
+        lines += [where + line + hint for line in error.lines]
         return None
 
 
@@ -369,10 +371,12 @@ def _open_controller(law: str | None, preset: str | None) -> Document:
     if law not in PRESETS:
         raise ConfigError(
             f"--controller {law}: no such controller; available: {', '.join(PRESETS)}, or a file (*.yaml, *.onnx)"
+            + did_you_mean(law, list(PRESETS))
         )
     if LAWS[law].needs_file:
         raise ConfigError(f"control law '{law}' has no presets: name its file in place of the law, such as {law}.onnx")
     preset = preset or PRESETS[law][-1]
     if preset not in PRESETS[law]:
-        raise ConfigError(f"--preset {preset}: no such preset of '{law}'; available: {', '.join(PRESETS[law])}")
+        hint = did_you_mean(preset, list(PRESETS[law]))
+        raise ConfigError(f"--preset {preset}: no such preset of '{law}'; available: {', '.join(PRESETS[law])}{hint}")
     return read_document(near(preset_file(law, preset)))

@@ -99,7 +99,9 @@ def _location(name: str, origin: Origin) -> tuple[Section, Location]:
     while end < len(name):
         match = _STEP.match(name, end)
         if match is None or (match[0].startswith(".") != bool(steps) and match[1] is not None):
-            raise ConfigError(f"{origin}: cannot read the key from column {end + 1}; {_EXAMPLE}")
+            index = re.match(r"\.([0-9]+)\b", name[end:])
+            hint = f"write {name[:end]}[{index[1]}]{name[end + index.end() :]}" if index and steps else _EXAMPLE
+            raise ConfigError(f"{origin}: cannot read the key from column {end + 1}; {hint}")
         steps.append(match[1] if match[1] is not None else int(match[2]))
         end = match.end()
     if not steps:

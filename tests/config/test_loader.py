@@ -112,6 +112,8 @@ BAD_MISSION = [
             "paper_slow_leakage, model_free, recommended"
         ],
     ),
+    ("arm_deg: [100.0, 60.0]", "arm_deg: unfold", [f'{CATCH}:39:14: phases[2].arm_deg: expected joint angles or a pose of the vehicle (folded, unfolded), got "unfold" (did you mean unfolded?)']),
+    ("vehicle: ../vehicles/tarot650_2r.yaml", "vehicle: ../vehicle/tarot650_2r.yaml", [f"{CATCH}:8:10: vehicle: configs/vehicle/tarot650_2r.yaml: no such file; the shipped file is named without a path: vehicle: tarot650_2r"]),
     ("schema_version: 1", "schema_version: 2", [f"{CATCH}:6:17: schema_version: expected 1, got 2"]),
     ("schema_version: 1", "schema_version: true", [f"{CATCH}:6:17: schema_version: expected 1, got true"]),
     (
@@ -211,6 +213,9 @@ BAD_OVERRIDES = [
     ("world.payload_kg", "--set world.payload_kg: no '='; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world=1", "--set world: the key names a whole section; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
     ("world..a=1", "--set world..a: cannot read the key from column 6; expected SECTION.KEY=VALUE, for example --set world.payload_kg=0.2"),
+    ("mission.phases.0.height_m=1", "--set mission.phases.0.height_m: cannot read the key from column 15; write mission.phases[0].height_m"),
+    ("controller.kp=[1, 2]", "--set controller.kp: unknown key; did you mean stiffness_kp?"),
+    ("vehicle.tether.knot=1", "--set vehicle.tether.knot: unknown key; known keys: anchor_world_m, length_m, attachment_body_m, margin_m, load_rating_n, weight_n_per_m, turns_max, taut_slack_m, pull_min_n, pull_filter_s, pull_time_s, separation_m, rotor_inner_radius_m, clearance_min_m"),
     ("world.payload_kg=3", "--set world.payload_kg: expected a number from 0 to 2, got 3"),
     ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of 48 names ("mocap_loss", "mocap_occluded", "mocap_jump", ...), got "mocap_los" (did you mean mocap_loss?)'),
     ("world.throw_velocity_m_s=[1, 2", "--set world.throw_velocity_m_s: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"),
@@ -229,6 +234,28 @@ def test_bad_override(project: Path, option: str, line: str) -> None:
     assert lines_of(lambda: load_sitl(CATCH, preset="paper", overrides=[option])) == [line]
 
 
+@pytest.mark.parametrize(
+    ("role", "name", "line"),
+    [
+        ("mission", VEHICLE, f"{VEHICLE}: is a vehicle file, expected a mission file"),
+        ("vehicle", CATCH, f"{CATCH}: is a mission file, expected a vehicle file"),
+        ("world", CATCH, f"{CATCH}: is a mission file, expected a world file"),
+    ],
+)
+def test_a_file_of_another_kind_is_one_problem(project: Path, role: str, name: str, line: str) -> None:
+    given = {"mission": CATCH, "vehicle": VEHICLE, "world": "lab", role: name}
+    assert lines_of(lambda: load_sitl(given["mission"], given["vehicle"], world=given["world"])) == [line]
+
+
+def test_the_known_keys_of_a_mapping_are_listed_once(project: Path) -> None:
+    path = project / CATCH
+    path.write_text(path.read_text().replace("start:\n", "start:\n  qqq: 1\n  zzz: 2\n"))
+    assert lines_of(lambda: load_sitl(CATCH)) == [
+        f"{CATCH}:12:3: start.qqq: unknown key; known keys: yaw_tolerance_deg, arm_tolerance_deg, takeoff",
+        f"{CATCH}:13:3: start.zzz: unknown key",
+    ]
+
+
 def test_problems_of_all_files_are_reported_together(project: Path) -> None:
     overrides = ["mission.phases[2].duration_s=0", "vehicle.airframe.mass_kg=0", "controller.nu=1", "world.seed=-1"]
     lines = lines_of(lambda: load_sitl(CATCH, overrides=overrides))
@@ -242,13 +269,13 @@ def test_problems_of_all_files_are_reported_together(project: Path) -> None:
 
 def test_unknown_controller_and_preset(project: Path) -> None:
     assert lines_of(lambda: load_sitl(CATCH, controller_law="cscc")) == [
-        "--controller cscc: no such controller; available: adaptive, csc, psc, policy, or a file (*.yaml, *.onnx)"
+        "--controller cscc: no such controller; available: adaptive, csc, psc, policy, or a file (*.yaml, *.onnx) (did you mean csc?)"
     ]
     assert lines_of(lambda: load_sitl(CATCH, controller_law="psc", preset="paper")) == [
         "--preset paper: no such preset of 'psc'; available: tuned_extras, tuned"
     ]
     assert lines_of(lambda: load_sitl(CATCH, preset="papr")) == [
-        "--preset papr: no such preset of 'adaptive'; available: paper, paper_slow_leakage, model_free, recommended"
+        "--preset papr: no such preset of 'adaptive'; available: paper, paper_slow_leakage, model_free, recommended (did you mean paper?)"
     ]
 
 
