@@ -227,7 +227,9 @@ class FlightDisplay:
         warned = [row for row in rows if not row.ok and not row.refuses]
         refused = len(refusals(rows))
         told = f"{len(rows)} checks: " + (f"{refused} refused" if refused else "ok")
-        self._line("preflight", told + (f", {len(warned)} warnings" if warned else ""), "red" if refused else "green")
+        if warned:
+            told += f", {len(warned)} warning" + ("" if len(warned) == 1 else "s")
+        self._line("preflight", told, "red" if refused else "green")
         for row in warned:
             self._line("", row.line(), "yellow")
 
@@ -277,52 +279,72 @@ def print_result(
         ("arm error, RMS", "e_alpha_deg", "deg", 2),
     ):
         table.add_row(label, *(cell(part, key, unit, digits=digits) for part in parts))
-    facts = Table.grid(padding=(0, 2))
+    facts: list[tuple[str, str]] = []
     style = _OUTCOME_STYLE.get(outcome, "bold red")
-    facts.add_row("outcome", f"[{style}]{outcome}[/]")
-    facts.add_row("controller", f"{summary['controller']} ({summary['preset']})")
+    facts.append(("outcome", f"[{style}]{outcome}[/]"))
+    event = _decisive_event(summary)
+    if event is not None:
+        facts.append(("event", f"{event['id']}: {escape(event['text'])}"))
+    facts.append(("controller", f"{summary['controller']} ({summary['preset']})"))
     world = summary.get("world")
     if world is not None:
-        facts.add_row("world", f"{world['name']}, seed {world['seed']}")
+        facts.append(("world", f"{world['name']}, seed {world['seed']}"))
     catches = catches or catch is not None
     if catches and summary.get("payload_kg") is not None:
-        facts.add_row("payload", f"{summary['payload_kg']:g} kg (known to the simulated world only)")
+        facts.append(("payload", f"{summary['payload_kg']:g} kg (known to the simulated world only)"))
     doubt = (
         ""
         if summary.get("catch_confirmed") is not False
         else ", not confirmed: the flight ended too soon after the impact"
     )
     if catches:
-        facts.add_row("catch", "none" if catch is None else f"t = {catch:.2f} s{doubt}")
+        facts.append(("catch", "none" if catch is None else f"t = {catch:.2f} s{doubt}"))
     for name, text in contact:
-        facts.add_row(name, escape(text))
+        facts.append((name, escape(text)))
     loop, clock = summary.get("loop") or {}, summary.get("clock") or {}
     if loop.get("ticks"):
         rate_hz, late_ms = loop["rate_hz"], loop["lateness_ms"]["p99"]  # None after a tick or two
         rate = "" if rate_hz is None else f"{rate_hz:.0f} Hz, "
         simulated = clock.get("kind") == "simulated"
         late = "" if late_ms is None or simulated else f", late p99 {late_ms:.1f} ms"
-        facts.add_row("control loop", f"{rate}{loop['ticks']} ticks, {loop['missed']} missed{late}")
+        facts.append(("control loop", f"{rate}{loop['ticks']} ticks, {loop['missed']} missed{late}"))
     pace, speed = clock.get("pace"), clock.get("speed")
     if pace is not None:
         wanted = speed if isinstance(speed, float) else 1.0
         slow = ": this computer is busy" if pace < SLOW_PACE * min(1.0, wanted) else ""
-        facts.add_row("pace", f"{pace:.1f} x real time{slow}")
+        facts.append(("pace", f"{pace:.1f} x real time{slow}"))
     recorder = summary.get("recorder") or {}
     if recorder.get("samples") is not None:
-        facts.add_row("recorder", f"{recorder['samples']} ticks, {recorder['dropped']} dropped")
+        facts.append(("recorder", f"{recorder['samples']} ticks, {recorder['dropped']} dropped"))
     slack = (summary.get("tether") or {}).get("min_slack_m")
     if slack is not None:
-        facts.add_row("tether", f"minimum slack {slack:.2f} m")
+        facts.append(("tether", f"minimum slack {slack:.2f} m"))
     every = summary.get("graded_every", 1)
     if every > 1:
-        facts.add_row("graded", f"one tick in {every} of a long flight; loop and latencies: every tick")
-    facts.add_row("report", str(report) if report else f"none; the flight's other files, if any, are in {out}")
-    console.print()
-    console.print(facts, highlight=False, soft_wrap=True)
+        facts.append(("graded", f"one tick in {every} of a long flight; loop and latencies: every tick"))
+    facts.append(("report", escape(str(report) if report else f"none; see the folder {out}")))
+    _print_facts(console, facts)
     if outcome != "refused":
         console.print()
         console.print(table, highlight=False)
+
+
+def _decisive_event(summary: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the first of the events with the most severe action of a flight that took off and was not completed, or None."""
+    if summary["outcome"] in ("completed", "refused"):
+        return None
+    event: dict[str, Any] | None = max(
+        summary.get("events", ()), key=lambda event: SafetyAction(event["action"]).rank, default=None
+    )
+    return None if event is None or SafetyAction(event["action"]) is SafetyAction.NOMINAL else event
+
+
+def _print_facts(console: Console, facts: Sequence[tuple[str, str]]) -> None:
+    """Print names and texts, both with markup, in two columns. No line is wrapped or padded, so that paths can be copied."""
+    width = max(len(name) for name, _ in facts)
+    console.print()
+    for name, text in facts:
+        console.print(f"{name:<{width}}  {text}", highlight=False, soft_wrap=True)
 
 
 def print_team_result(console: Console, summary: dict[str, Any], path: Path) -> None:
@@ -333,11 +355,15 @@ def print_team_result(console: Console, summary: dict[str, Any], path: Path) -> 
         path: report of the flight, or the folder of a flight without one.
     """
     outcome = summary["outcome"]
-    facts = Table.grid(padding=(0, 2))
-    facts.add_row("outcome", f"[{_OUTCOME_STYLE.get(outcome, 'bold red')}]{outcome}[/]")
+    facts: list[tuple[str, str]] = []
+    facts.append(("outcome", f"[{_OUTCOME_STYLE.get(outcome, 'bold red')}]{outcome}[/]"))
     for end, member in summary["members"].items():
         error_m = (member["rms"].get("pre") or {}).get("e_p_m")
-        facts.add_row(end, member["outcome"] + ("" if error_m is None else f", position error {error_m:.4f} m RMS"))
+        event = _decisive_event(member)
+        why = "" if event is None else f" by {event['id']}"
+        facts.append(
+            (end, member["outcome"] + why + ("" if error_m is None else f", position error {error_m:.4f} m RMS"))
+        )
     team = summary["team"]
     for name, key, unit in (
         ("bar, position error", "bar_p_rms_m", "m RMS"),
@@ -346,7 +372,6 @@ def print_team_result(console: Console, summary: dict[str, Any], path: Path) -> 
         ("left vehicle's share", "share", "of the weight"),
         ("let go", "let_go", "m above its stand"),
     ):
-        facts.add_row(name, "-" if team[key] is None else f"{team[key]:.3f} {unit}")
-    facts.add_row("report" if path.suffix == ".html" else "files", str(path))
-    console.print()
-    console.print(facts, highlight=False, soft_wrap=True)
+        facts.append((name, "-" if team[key] is None else f"{team[key]:.3f} {unit}"))
+    facts.append(("report" if path.suffix == ".html" else "files", escape(str(path))))
+    _print_facts(console, facts)

@@ -53,6 +53,26 @@ def test_a_flight_of_one_tick_has_neither_rate_nor_lateness() -> None:
     ]
 
 
+def test_the_result_names_the_event_that_ended_the_flight_on_one_line() -> None:
+    """The first of the events with the most severe action, by the id under which the troubleshooting page has it."""
+    events = [
+        {"id": name, "action": action, "text": f"what {name} means [and more], which is longer than the line is wide"}
+        for name, action in (("a", "nominal"), ("b", "warn"), ("c", "land"), ("d", "land"), ("e", "hold"))
+    ]
+    known = {"controller": "adaptive", "preset": "recommended", "rms": {}}
+
+    def rows(outcome: str, count: int) -> list[str]:
+        out = io.StringIO()
+        folder = Path("a folder [of mine] with a long name")
+        print_result(Console(file=out, width=60), known | {"outcome": outcome, "events": events[:count]}, folder, None)
+        assert f"report      none; see the folder {folder}" in out.getvalue().splitlines()
+        return [line for line in out.getvalue().splitlines() if line.startswith("event")]
+
+    assert rows("aborted", 5) == [f"event       c: {events[2]['text']}"]
+    assert rows("aborted", 2) == [f"event       b: {events[1]['text']}"]
+    assert rows("aborted", 1) == rows("completed", 5) == rows("refused", 5) == []
+
+
 def messages_of(tick: int, outputs: Outputs) -> list[AnyMessage]:
     """As the flight process sends them in one tick."""
     t_s, mission_t_s = outputs.t_s, outputs.mission_t_s
