@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import importlib
 import re
@@ -50,12 +51,28 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `companion`."""
     prepare_streams()
     use_default_signals()
-    words = _normalised(list(sys.argv[1:] if argv is None else argv))
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _run(_normalised(words))
+    except KeyboardInterrupt:  # also while modules are imported, which takes most of the time of a short command
+        from companion.model.exit_codes import EXIT_ABORTED
+
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"{' '.join(['companion', *words[:1]])}: interrupted\n")
+        return EXIT_ABORTED
+
+
+def _run(words: list[str]) -> int:
+    """Run the command and return its exit code.
+
+    Args:
+        words: the command line after `_normalised`.
+    """
     arguments, unknown = make_parser(words[:1]).parse_known_args(words)
     # Imported here, because printing the version needs none of it.
     from companion.config.document import ConfigError
     from companion.install.extras import missing_extra
-    from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+    from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
     from companion.plugins import PluginError
     from companion.runtime.console import SteadyStream, print_error
 
@@ -84,9 +101,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             return EXIT_OK
         print_error(f"companion {arguments.command}: standard output cannot be written: {error.strerror}")
         return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        print_error(f"companion {arguments.command}: interrupted")
-        return EXIT_ABORTED
     return code
 
 

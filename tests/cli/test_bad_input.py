@@ -18,7 +18,7 @@ import pytest
 
 from companion.cli.campaign import reserved_folder
 from companion.cli.main import main
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
 from tests.analysis.synthetic_flight import record_flight
 from tests.support import CATCH, ROOT, Ended, Sandbox, sandbox_in
 
@@ -294,3 +294,13 @@ def test_characters_that_the_encoding_of_standard_output_lacks_are_escaped(tmp_p
     )  # fmt: skip
     assert (ended.returncode, ended.stderr) == (EXIT_OK, "")
     assert ended.stdout.startswith(r"Fl\xe4che: controllers, ")
+
+
+def test_an_interrupt_while_modules_are_imported_is_one_line(
+    companion: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("companion.cli.main.importlib.import_module", interrupted)
+    assert companion("replay", "flight.mcap") == Ended(EXIT_ABORTED, "", "companion replay: interrupted\n")
