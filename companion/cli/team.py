@@ -96,9 +96,6 @@ def _fly(arguments: argparse.Namespace) -> int:
     speed = speed_of(arguments)
     if speed is not None and not speed > 0.0:
         return EXIT_BAD_INPUT
-    if arguments.out is not None and not arguments.out.strip():
-        print_error("companion team fly: --out: expected the name of a folder, got an empty one")
-        return EXIT_BAD_INPUT
     team = _loaded(arguments)
     problems = [
         f"{end}: {line}"
