@@ -6,7 +6,7 @@ import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -123,12 +123,15 @@ def adaptation_markdown(groups: Sequence[Group]) -> str:
     return markdown(head, rows)
 
 
-def ablation_markdown(groups: Iterable[Group]) -> str:
+def ablation_markdown(groups: Sequence[Group], differences: Mapping[int, Pairs]) -> str:
     """Return one line per ablation with `ABLATION_KG`."""
-    head = ("taken away", "with the payload", *(title for title, _, _ in _ABLATION_FIGURES))
+    head = ["taken away", "with the payload", *(title for title, _, _ in _ABLATION_FIGURES)]
+    head.insert(4, f"after, against {REFERENCE}, mm")
     rows = [
-        (group.preset.partition(LESS)[2], _completed(group), *_spreads(group, _ABLATION_FIGURES)) for group in groups
+        [group.preset.partition(LESS)[2], _completed(group), *_spreads(group, _ABLATION_FIGURES)] for group in groups
     ]
+    for row, group in zip(rows, groups, strict=True):
+        row.insert(4, difference_text(differences[id(group)]) if id(group) in differences else "")
     return markdown(head, rows)
 
 
@@ -293,7 +296,7 @@ def tables(files: Sequence[Results]) -> dict[str, str]:
         "soft": (laws_markdown, soft),
         "model error": (model_error_markdown, by_error),
         "adaptation": (adaptation_markdown, paired),
-        "ablation": (ablation_markdown, ablated),
+        "ablation": (partial(ablation_markdown, differences=pairs_with_reference([*first, *ablated])), ablated),
     }
     flown = {name: _with_source(table(of), of) for name, (table, of) in made.items() if of}
     return {**flown, "differences": differences_markdown(first), "told": knowledge_markdown()}
