@@ -129,9 +129,10 @@ def fly(config: SitlConfig) -> Row | None:
     net, payload = scene.data.xpos[scene.model.body("net").id], scene.payload
 
     def watch(outputs: Any) -> bool:
-        if not found and payload.ball is not None and payload.flying is not None:
-            speeds = scene.data.qvel[payload.ball.v : payload.ball.v + 3]
-            found.append((scene.t_s, payload.flying[0], tuple(speeds.tolist()), tuple(net.tolist()), outputs.reference))
+        ball, q, v = payload.ball, scene.data.qpos, scene.data.qvel
+        if not found and ball is not None and payload.flying is not None:
+            places = (q[ball.q : ball.q + 3], v[ball.v : ball.v + 3], net)
+            found.append((scene.t_s, *(tuple(place.tolist()) for place in places), outputs.reference))
         return False
 
     result = fast.run(limit_s(config), until=watch)
