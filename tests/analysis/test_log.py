@@ -125,7 +125,7 @@ def test_a_file_that_is_no_flight_log_is_refused_in_one_line(flight: FlightLog, 
     damaged.write_bytes(data)
     for path, reason in (
         (tmp_path / "absent", "No such file"),
-        (tmp_path, "directory"),
+        (tmp_path, "is a folder"),
         (text, "not an MCAP file"),
         (empty, "is empty"),
         (foreign, "not a flight log"),

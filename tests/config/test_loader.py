@@ -482,7 +482,7 @@ def test_a_key_in_both_spellings_is_refused(tmp_path: Path) -> None:
 def test_a_flights_configuration_holds_nothing_of_the_simulated_world(project: Path) -> None:
     config = load_sitl(CATCH, overrides=["world.payload_kg=0.37", "vehicle.name=other"])
     text = config.flight.model_dump_json()
-    assert "0.37" not in text and set(json.loads(text)) == {"mission", "vehicle", "controller", "sources"}
+    assert "0.37" not in text and set(json.loads(text)) == {"mission", "vehicle", "controller", "sources", "agreed"}
     assert config.flight.sources.overrides == ("vehicle.name=other",)
     with pytest.raises(ValueError, match="world"):
         FlightConfig.model_validate_json(config.model_dump_json())

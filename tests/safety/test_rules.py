@@ -80,7 +80,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "joint_far_beyond_limit": (LAND, LAND, 0.300),
     "force_lost": (LAND, WARN, 0.265),  # in the air the law flies on without it; a flight does not begin without it
     "force_overload": (WARN, WARN, 0.015),
-    "force_stuck": (None, WARN, 0.275),
+    "force_stuck": (None, WARN, 0.525),
     "force_drift": (None, WARN, 2.850),
     "force_disagrees": (None, WARN, 0.545),  # the law flies on without it
     "loop_late": (WARN, WARN, 0.215),

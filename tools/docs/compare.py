@@ -315,7 +315,8 @@ def main(argv: list[str] | None = None) -> int:
         reason = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
         print(f"{', '.join(map(str, arguments.results))}: {reason}", file=sys.stderr)
         return 2
-    for name, _, _, figure in distributions(aggregate(rows)):
+    # The companion's own laws: with the others the plots are crowded.
+    for name, _, _, figure in distributions(aggregate([row for row in rows if row["controller"] in LAWS])):
         table, alt = PICTURES.get(name, ("", ""))
         if table in found:
             picture = Path("pictures") / f"compare_{name}.svg"
