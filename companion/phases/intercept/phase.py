@@ -30,6 +30,8 @@ from companion.safety.notices import EventDefinition
 
 ASTRAY_M: Final = 0.3
 """Distance from the planned meeting point beyond which a ball is another one."""
+UNSURE_S: Final = 0.45
+"""Time to the meeting above which a chase is not given up for the rotors: later frames show more, and a dodge does not need more."""
 AMISS: Final = 0.5
 """Share of the net's deviation from the assumed response that is expected to be left at the meeting."""
 REST_S: Final = 1.0
@@ -252,10 +254,10 @@ class Intercept(Phase):
         if not new or left_s < FROZEN_S:
             return s
         path = self._path(air, s, s.candidates[number])
-        plan = self._meeting(air, s, path, point.t_s)
+        plan = self._meeting(air, s, path, point.t_s) or self._meeting(air, s, path, None)
         if plan is not None:
             return _planned(s, plan, plan.point.t_s - air.t_s)
-        return chosen(air, s, self._bounds(air, s), path)
+        return s if left_s > UNSURE_S else chosen(air, s, self._bounds(air, s), path)
 
     def _dodged(self, air: Air, s: Interception, new: bool) -> Interception:
         """Return the state of a dodge with what the newest frame shows."""
