@@ -256,6 +256,8 @@ class ServoBus:
         self._last_byte_s = 0.0
         self._line_free_s = 0.0
         self._timers: set[asyncio.TimerHandle] = set()
+        self.unsent = 0
+        """Number of answers that wait for their time on the wire."""
 
     @property
     def path(self) -> str:
@@ -293,7 +295,8 @@ class ServoBus:
         on_wire_s = (len(data) + len(answer)) * _BITS_PER_BYTE / baud_bps
         self._line_free_s = max(now_s, self._line_free_s) + on_wire_s + delay_s + self.answers_late_s
         self._timers = {timer for timer in self._timers if not timer.cancelled() and timer.when() > now_s}
-        self._timers.add(loop.call_at(self._line_free_s, self._send, answer))
+        self._timers.add(loop.call_at(self._line_free_s, self._send_in_time, answer))
+        self.unsent += 1
 
     def fileno(self) -> int:
         """Return the descriptor that is readable when an instruction has arrived."""
@@ -318,6 +321,10 @@ class ServoBus:
             middle = len(data) // 2
             data = data[:middle] + bytes((data[middle] ^ 0x5A,)) + data[middle + 1 :]
         return self.line.exchange(data, baud_bps)
+
+    def _send_in_time(self, answer: bytes) -> None:
+        self.unsent -= 1
+        self._send(answer)
 
     def _send(self, answer: bytes) -> None:
         dropped = self._pty.write(answer)

@@ -6,20 +6,22 @@ Where nothing has to move, the servos lie on a bench: their bus alone, in this p
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
-import os
+import select
 import shutil
-import sys
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import AsyncExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from companion.io.devices import AvailableDevices, PoseForwarder
 from companion.io.dynamixel.arm import DynamixelArm
+from companion.io.dynamixel.port import ServoPort
 from companion.io.dynamixel.scale import RAD_PER_COUNT
 from companion.io.protocols import DeviceError
 from companion.model.check_row import Row
@@ -27,7 +29,6 @@ from companion.model.exit_codes import EXIT_OK
 from companion.preflight import arm as preflight
 from companion.preflight.observe import observe
 from companion.runtime.clock import flight_clock
-from companion.runtime.realtime import GIL_SWITCH_S, WORLD_PRIORITY
 from companion.sitl_config.loader import load_sitl
 from sitl.servo.bus import ServoBus
 from sitl.servo.from_config import plugged_in, servos_of
@@ -43,6 +44,8 @@ PATIENT = ("vehicle.devices.arm.watchdog_ms=1500", "vehicle.safety.arm_timeout_s
 
 OF_THE_COMPUTER = {"arm.reads"}
 _LOOK = "vehicle.safety.preflight_s=1.0"
+NOISE_MS = 20_000.0
+"""A line on which something still arrives after this time is noisy."""
 
 
 @dataclass(frozen=True)
@@ -144,27 +147,36 @@ def bench(folder: Path, servos: str = "[{}, {}]") -> Iterator[Rig]:
 def served(bus: ServoBus) -> Iterator[str]:
     """The bus's port; its event loop runs in a thread."""
     loop = asyncio.new_event_loop()
-
-    def serve() -> None:
-        # A simulated world answers in time as well, whatever the tests beside it compute.
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(WORLD_PRIORITY))
-        loop.run_forever()
-
-    thread, interval_s = threading.Thread(target=serve, name="bench"), sys.getswitchinterval()
-    sys.setswitchinterval(GIL_SWITCH_S)
+    thread = threading.Thread(target=loop.run_forever, name="bench")
     thread.start()
     try:
         asyncio.run_coroutine_threadsafe(bus.__aenter__(), loop).result()
         try:
-            yield bus.path
+            with _patience(bus):
+                yield bus.path
         finally:
             asyncio.run_coroutine_threadsafe(bus.__aexit__(None, None, None), loop).result()
     finally:
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
         loop.close()
-        sys.setswitchinterval(interval_s)
+
+
+@contextmanager
+def _patience(bus: ServoBus) -> Iterator[None]:
+    """In this process a reply is missing only once the bus has answered all that it was asked, however late a busy computer lets it."""
+    timed_out = ServoPort.isPacketTimeout
+
+    def is_missing(port: ServoPort) -> bool:
+        if not timed_out(port):
+            return False
+        while select.select((bus,), (), (), 0.0)[0] or bus.unsent:
+            time.sleep(0.0005)
+        return not port.ser.in_waiting or port.getTimeSinceStart() > NOISE_MS
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(ServoPort, "isPacketTimeout", is_missing)
+        yield
 
 
 def _copy(folder: Path) -> Path:
