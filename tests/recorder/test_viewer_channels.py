@@ -351,7 +351,8 @@ def test_no_sick_tick_is_lost_or_stops_the_viewers(tmp_path: Path) -> None:
     for k in range(150):
         inputs, outputs, sent = sick(healthy, chance)
         # What the flight counts itself is always whole.
-        rows.append((replace(inputs, tick=k), replace(outputs, tick=k), replace(sent, tick=k)))
+        t_s = 6.0 + 0.005 * k
+        rows.append((replace(inputs, tick=k, t_s=t_s), replace(outputs, tick=k, t_s=t_s), replace(sent, tick=k)))
     path = tmp_path / "flight.mcap"
     last = healthy[-1]
     viewed = written(path, [*rows, last])
