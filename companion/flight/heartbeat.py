@@ -70,16 +70,43 @@ class Heartbeats:
         if outputs.request is AutopilotRequest.ARM:
             self._arm_s = inputs.t_s
         may_lift = self.may_be_armed(inputs.status, inputs.t_s) or outputs.phase_kind in _IN_THE_AIR
-        link = self._identity
-        return Heartbeat(
-            tick=inputs.tick,
-            t_s=inputs.t_s,
-            origin_s=self._origin_s,
-            mission_t_s=outputs.mission_t_s,
+        return self._heartbeat(
+            inputs.tick,
+            inputs.t_s,
+            outputs.mission_t_s,
             lifting=may_lift,
             pilot=self._pilot,
-            goodbye=False,
             mocap_refused=self._lands_without_mocap and not outputs.mocap_trusted,
+            partner_session=partner_session,
+            back_world_m=self._back_world_m(outputs.contact),
+        )
+
+    def found_armed(self, t_s: float, status: AutopilotStatus | None) -> Heartbeat:
+        """Return the heartbeat of a process that lands a vehicle that it has found armed, without the core."""
+        return self._heartbeat(0, t_s, 0.0, lifting=True, pilot=flown_by_pilot(status))
+
+    def _heartbeat(
+        self,
+        tick: int,
+        t_s: float,
+        mission_t_s: float,
+        *,
+        lifting: bool,
+        pilot: bool,
+        mocap_refused: bool = False,
+        partner_session: int = 0,
+        back_world_m: Vec3 | None = None,
+    ) -> Heartbeat:
+        link = self._identity
+        return Heartbeat(
+            tick=tick,
+            t_s=t_s,
+            origin_s=self._origin_s,
+            mission_t_s=mission_t_s,
+            lifting=lifting,
+            pilot=pilot,
+            goodbye=False,
+            mocap_refused=mocap_refused,
             autopilot_system=link.autopilot_system,
             own_system=link.own_system,
             own_component=link.own_component,
@@ -89,28 +116,7 @@ class Heartbeats:
             attitude_wxyz=self._attitude_wxyz,
             peer=link.peer,
             partner_session=partner_session,
-            back_world_m=self._back_world_m(outputs.contact),
-        )
-
-    def found_armed(self, t_s: float, status: AutopilotStatus | None) -> Heartbeat:
-        """Return the heartbeat of a process that lands a vehicle that it has found armed, without the core."""
-        link = self._identity
-        return Heartbeat(
-            tick=0,
-            t_s=t_s,
-            origin_s=self._origin_s,
-            mission_t_s=0.0,
-            lifting=True,
-            pilot=flown_by_pilot(status),
-            goodbye=False,
-            mocap_refused=False,
-            autopilot_system=link.autopilot_system,
-            own_system=link.own_system,
-            own_component=link.own_component,
-            local_port=link.local_port,
-            pose_stamp_s=self._pose_stamp_s,
-            position_world_m=self._position_world_m,
-            peer=link.peer,
+            back_world_m=back_world_m,
         )
 
     def may_be_armed(self, status: AutopilotStatus | None, t_s: float) -> bool:

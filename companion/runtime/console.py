@@ -226,10 +226,10 @@ class FlightDisplay:
         self._progress.update(self._task, description="starting", completed=0.0, note="")
         warned = [row for row in rows if not row.ok and not row.refuses]
         refused = len(refusals(rows))
-        told = f"{len(rows)} checks: " + (f"{refused} refused" if refused else "ok")
+        text = f"{len(rows)} checks: " + (f"{refused} refused" if refused else "ok")
         if warned:
-            told += f", {len(warned)} warning" + ("" if len(warned) == 1 else "s")
-        self._line("preflight", told, "red" if refused else "green")
+            text += f", {len(warned)} warning" + ("" if len(warned) == 1 else "s")
+        self._line("preflight", text, "red" if refused else "green")
         for row in warned:
             self._line("", row.line(), "yellow")
 

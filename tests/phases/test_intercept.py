@@ -525,6 +525,21 @@ def test_a_chase_in_which_the_ball_comes_to_the_rotors_stops_unless_the_stop_or_
     assert "ball_at_rotors" in flown.ids and (flown.states[-1].mode is Mode.STOP) == stops
 
 
+def test_a_chase_is_not_given_up_for_the_rotors_before_a_dodge_needs_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    def room_of_plan_m(air: Air, s: Interception, *_: Any) -> float:
+        return 1.0 if s.mode is Mode.WAIT else 0.02
+
+    monkeypatch.setattr(phase, "room_of_plan_m", room_of_plan_m)
+    monkeypatch.setattr(choice, "room_of_plan_m", room_of_plan_m)
+    flown = Flown(frames([MEETABLE], 0.6), 0.5)
+    left_s = [
+        state.plan.point.t_s - number * TICK_PERIOD_S
+        for number, state in enumerate(flown.states, 1)
+        if state.at_rotors and state.plan is not None
+    ]
+    assert phase.UNSURE_S - 0.03 < left_s[0] <= phase.UNSURE_S + TICK_PERIOD_S
+
+
 @pytest.mark.parametrize(("room_m", "goes_on"), [(0.045, True), (0.035, False)])
 def test_a_ball_that_is_chased_may_come_a_centimetre_nearer_to_the_rotors_than_one_that_is_not(
     room_m: float, goes_on: bool, monkeypatch: pytest.MonkeyPatch
