@@ -171,17 +171,22 @@ class Pairs:
 
     @property
     def difference_95(self) -> tuple[float, float, float] | None:
-        """Median of this variant's error minus the other's in m, and its 95 % confidence interval: the medians that the sign
-        test does not reject. None for fewer than six pairs, which have no such interval.
-        """
-        differences = sorted(this - base for base, this in self.base_m_this_m)
-        n = len(differences)
-        outside = next(k for k, count in enumerate(_tosses(n)) if 40 * count > 1 << n)
-        return (differences[(n - 1) // 2], differences[outside - 1], differences[n - outside]) if outside else None
+        """Median of this variant's error minus the other's in m, and its 95 % confidence interval; None for fewer than six pairs."""
+        return median_95([this - base for base, this in self.base_m_this_m])
 
     def p50(self, part: int) -> float | None:
         """Return the median error of the variant compared with (0) or of this one (1); None if the median flight failed."""
         return _percentile(sorted(pair[part] for pair in self.base_m_this_m), 0.5)
+
+
+def median_95(values: Iterable[float]) -> tuple[float, float, float] | None:
+    """Return the median of some values and its 95 % confidence interval: the medians that the sign test does not reject. None for
+    fewer than six values, which have no such interval.
+    """
+    ordered = sorted(values)
+    n = len(ordered)
+    outside = next(k for k, count in enumerate(_tosses(n)) if 40 * count > 1 << n)
+    return (ordered[(n - 1) // 2], ordered[outside - 1], ordered[n - outside]) if outside else None
 
 
 def adaptation_pairs(groups: Sequence[Group]) -> list[Pairs]:
