@@ -7,6 +7,8 @@ metadata of PX4 1.16.1 and 1.18; `companion.px4.versions` says which versions ha
 
 from __future__ import annotations
 
+from functools import partial
+
 from companion.config.vehicle import Vehicle
 from companion.model.check_row import Level
 from companion.model.constants import GRAVITY_M_S2, PX4_YAW_P
@@ -47,7 +49,10 @@ def _above_abort(vehicle: Vehicle) -> tuple[float, float]:
     return vehicle.safety.tilt_abort_deg + _FAILURE_MARGIN_DEG, 180.0
 
 
-_WARN = Level.WARN
+_advised = partial(Wanted, level=Level.WARN)
+"""A parameter that only warns."""
+_telem2 = partial(_advised, reboot=True, hardware=True)
+"""The same, of the serial port."""
 _RAISES = "delay of a sensor that is not fused, ms; a value above EKF2_DELAY_MAX makes PX4 raise that, so this is written first"
 _FOLLOWS = "time constant with which the output follows the delayed filter, s; with a larger value, IMU errors persist for longer"
 _CEILING = "0 to `room.z_m` minus 0.3"
@@ -68,11 +73,10 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             reboot=True,
         ),
         Wanted("EKF2_GPS_CTRL", 0, "a GPS fix through a window would shift the position estimate out of the room"),
-        Wanted(
+        _advised(
             "EKF2_BARO_CTRL",
             1,
             "without it, PX4 has no height 4.5 s after motion capture is lost: it descends blindly and finds the floor late or never",
-            _WARN,
         ),
         Wanted(
             "EKF2_MAG_TYPE",
@@ -80,8 +84,8 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "steel and motors disturb the compass; the yaw source would switch between the compass and motion capture",
             reboot=True,
         ),
-        Wanted("EKF2_OF_CTRL", 0, "an optical flow sensor would mistake the arm's motion for the vehicle's", _WARN),
-        Wanted("EKF2_RNG_CTRL", 0, "a range finder would mistake the arm or the net for the floor", _WARN),
+        _advised("EKF2_OF_CTRL", 0, "an optical flow sensor would mistake the arm's motion for the vehicle's"),
+        _advised("EKF2_RNG_CTRL", 0, "a range finder would mistake the arm or the net for the floor"),
         Wanted(
             "EKF2_EV_DELAY",
             5.0,
@@ -90,31 +94,28 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             limits=(0.0, 30.0),
             measured=True,
         ),
-        Wanted("EKF2_ASP_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=(0.0, 50.0)),
-        Wanted("EKF2_GPS_DELAY", 5.0, _RAISES, _WARN, reboot=True, limits=(0.0, 50.0)),
-        *(Wanted(f"SENS_GPS{n}_DELAY", 5, _RAISES, _WARN, reboot=True, limits=(0.0, 50.0)) for n in (0, 1)),
-        Wanted(
+        _advised("EKF2_ASP_DELAY", 5.0, _RAISES, reboot=True, limits=(0.0, 50.0)),
+        _advised("EKF2_GPS_DELAY", 5.0, _RAISES, reboot=True, limits=(0.0, 50.0)),
+        *(_advised(f"SENS_GPS{n}_DELAY", 5, _RAISES, reboot=True, limits=(0.0, 50.0)) for n in (0, 1)),
+        _advised(
             "EKF2_DELAY_MAX",
             50.0,
             "lag of the filter, ms, over which its output is predicted forward; with PX4's defaults (200 ms here, 0.25 s for "
             "EKF2_TAU_POS and EKF2_TAU_VEL), the estimate drifts by 3 to 4 mm",
-            _WARN,
             reboot=True,
             limits=(30.0, 60.0),
         ),
-        *(Wanted(f"EKF2_TAU_{of}", 0.1, _FOLLOWS, _WARN, limits=(0.1, 0.15)) for of in ("POS", "VEL")),
-        Wanted(
+        *(_advised(f"EKF2_TAU_{of}", 0.1, _FOLLOWS, limits=(0.1, 0.15)) for of in ("POS", "VEL")),
+        _advised(
             "EKF2_EVP_NOISE",
             0.01,
             "noise of the position, m; if it is much larger, the estimate follows the drift of the IMU instead of motion capture",
-            _WARN,
             limits=(0.005, 0.05),
         ),
-        Wanted(
+        _advised(
             "EKF2_EVA_NOISE",
             0.05,
             "noise of the attitude, rad; if it is much larger, yaw lags behind motion capture",
-            _WARN,
             limits=(0.01, 0.1),
         ),
         Wanted(
@@ -131,27 +132,23 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             )
             for axis in "XYZ"
         ),
-        Wanted(
-            "SYS_HAS_GPS", 0, "PX4 waits for a GPS that is not used and warns that it is missing", _WARN, reboot=True
-        ),
+        _advised("SYS_HAS_GPS", 0, "PX4 waits for a GPS that is not used and warns that it is missing", reboot=True),
         Wanted("SYS_HAS_MAG", 0, "PX4 refuses to arm if a compass is missing or disturbed by steel", reboot=True),
         Wanted("COM_ARM_WO_GPS", 1, "if 0, PX4 refuses to arm without GPS", ok=(1, 2)),
     ),
     "Attitude control": (
-        Wanted(
+        _advised(
             "MC_REF_W_N",
             200.0,
             "natural frequency of the model that attitude setpoints pass, rad/s; with PX4's 50 they lag by 40 ms, and the attitude "
             "error doubles (3.0 instead of 1.6 deg in the catch)",
-            _WARN,
             limits=(150.0, 1000.0),
         ),
-        Wanted(
+        _advised(
             "MC_YAW_P",
             PX4_YAW_P,
             "rate of yaw for each rad of its error, 1/s; the yaw setpoint leads by as much as PX4 would lag behind with 2.8, so "
             "that with another value a vehicle that turns is off by a part of that",
-            _WARN,
             limits=(2.2, 3.6),
             fix="set MC_YAW_P to 2.8, PX4's default, unless yaw swings with it",
             file=False,
@@ -192,11 +189,10 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             3,
             "3 lands when the radio is lost; 2 climbs and flies home, which can cross the tether; 5 and 6 stop the motors",
         ),
-        Wanted(
+        _advised(
             "COM_RCL_EXCEPT",
             0,
             "if bit 2 is set, PX4 ignores the loss of the radio in OFFBOARD, and the pilot cannot take over",
-            _WARN,
         ),
     ),
     "Other failsafes": (
@@ -205,25 +201,22 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             0,
             "with any other value, PX4 ends the flight when QGroundControl is closed; with 2, it climbs first",
         ),
-        Wanted(
+        _advised(
             "COM_LOW_BAT_ACT",
             2,
             "2 lands at critical battery charge if the vehicle has not landed before; 3 flies home, 0 only warns",
-            _WARN,
         ),
-        Wanted(
+        _advised(
             "BAT_CRIT_THR",
             0.1,
             "the companion's landing, which controls the position, must begin before PX4's own landing",
-            _WARN,
             limits=_below_own_landing,
             limits_text="0.05 to `safety.battery_min` minus 0.02",
         ),
-        Wanted(
+        _advised(
             "COM_FLTT_LOW_ACT",
             1,
             "3 flies home when PX4 estimates that the flight time is used up; with 0, PX4 was observed to leave OFFBOARD for HOLD",
-            _WARN,
         ),
         Wanted("GF_ACTION", 2, "3 climbs and flies home at PX4's own geofence, 4 stops the motors", ok=(0, 1, 2, 5)),
         Wanted(
@@ -233,26 +226,24 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             limits=_below_ceiling,
             limits_text=_CEILING,
         ),
-        Wanted(
+        _advised(
             "CBRK_FLIGHTTERM",
             121212,
             "any other value makes PX4 stop the motors in the air when it detects an attitude failure",
-            _WARN,
             reboot=True,
         ),
         *(
-            Wanted(
+            _advised(
                 f"FD_FAIL_{axis}",
                 60,
                 "tilt beyond which PX4 stops the motors in the first seconds after take-off, deg; it must be well above "
                 "`safety.tilt_abort_deg`",
-                _WARN,
                 limits=_above_abort,
                 limits_text="at least `safety.tilt_abort_deg` + 10, at most 180",
             )
             for axis in "RP"
         ),
-        Wanted("CBRK_SUPPLY_CHK", 0, "any other value disables the check of the supply voltage", _WARN),
+        _advised("CBRK_SUPPLY_CHK", 0, "any other value disables the check of the supply voltage"),
         Wanted("SYS_FAILURE_EN", 0, "if 1, one stray message could switch off a motor", reboot=True),
         Wanted("COM_THROW_EN", 0, "if 1, an armed vehicle that is picked up and moved fast would start its motors"),
     ),
@@ -279,12 +270,11 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "MC_AIRMODE", 0, "with airmode, the rotors of a standing vehicle turn at zero thrust, and it may tip over"
         ),
-        Wanted(
+        _advised(
             "MC_BAT_SCALE_EN",
             0,
             "if 1, PX4 scales every thrust by the battery's voltage, while the companion corrects the same sag by its estimate of the "
             "hover thrust: the two fight",
-            _WARN,
         ),
         Wanted(
             "COM_SPOOLUP_TIME",
@@ -304,94 +294,63 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             "time after arming within which the vehicle must take off, s; if it is too short, PX4 disarms during spool-up",
             limits=(5.0, 60.0),
         ),
-        Wanted(
+        _advised(
             "MPC_LAND_SPEED",
             0.7,
             "descent speed of PX4's own landing, m/s; the net touches down first",
-            _WARN,
             limits=(0.3, 1.0),
         ),
-        Wanted(
+        _advised(
             "MIS_TAKEOFF_ALT",
             1.0,
             "height to which the vehicle climbs if a pilot selects the mode Takeoff, m",
-            _WARN,
             limits=_below_ceiling,
             limits_text=_CEILING,
         ),
     ),
     "Limits of PX4's own modes: hold, return, land, position": (
-        Wanted(
+        _advised(
             "MPC_TILTMAX_AIR",
             25.0,
             "tilt limit of PX4's own modes, deg; if larger, PX4 may cross the room fast after a takeover",
-            _WARN,
             limits=(20.0, 45.0),
         ),
-        Wanted(
+        _advised(
             "MPC_ACC_HOR",
             8.0,
             "acceleration, m/s^2; if it is smaller, LAND stops further ahead (0.53 m after a takeover with PX4's default of 3); "
             "MPC_JERK_AUTO and MPC_TILTMAX_AIR keep the actual acceleration below it",
-            _WARN,
             limits=(5.0, 10.0),
         ),
-        Wanted(
+        _advised(
             "MPC_JERK_AUTO",
             6.0,
             "jerk, m/s^3; if smaller, PX4 brakes later; if larger, LAND approaches its stop point faster",
-            _WARN,
             limits=(4.0, 8.0),
         ),
-        Wanted(
+        _advised(
             "MPC_XY_VEL_MAX",
             2.0,
             "horizontal speed, m/s; if larger, there is not enough distance to stop",
-            _WARN,
             limits=(0.5, 3.0),
         ),
-        Wanted(
+        _advised(
             "MPC_Z_VEL_MAX_UP",
             1.0,
             "climb speed, m/s; if larger, there is not enough distance to stop below the ceiling",
-            _WARN,
             limits=(0.5, 2.0),
         ),
     ),
     "Serial link to the companion: TELEM2": (
-        Wanted(
-            "MAV_1_CONFIG",
-            102,
-            "with any other value, there is no MAVLink on TELEM2",
-            _WARN,
-            reboot=True,
-            hardware=True,
-        ),
-        Wanted(
-            "MAV_1_MODE",
-            2,
-            "the other modes send too few messages, and at rates that are too low",
-            _WARN,
-            reboot=True,
-            hardware=True,
-        ),
-        Wanted(
+        _telem2("MAV_1_CONFIG", 102, "with any other value, there is no MAVLink on TELEM2"),
+        _telem2("MAV_1_MODE", 2, "the other modes send too few messages, and at rates that are too low"),
+        _telem2(
             "MAV_1_RATE",
             80000,
             "data rate, B/s; 0 means half of the link's bandwidth, and PX4 then reduces the rate of every stream",
-            _WARN,
-            reboot=True,
-            hardware=True,
             limits=(60000.0, 92160.0),
         ),
-        Wanted(
-            "SER_TEL2_BAUD",
-            921600,
-            "a slower link cannot carry the state at full rate",
-            _WARN,
-            reboot=True,
-            hardware=True,
-        ),
+        _telem2("SER_TEL2_BAUD", 921600, "a slower link cannot carry the state at full rate"),
     ),
 }
 """Parameters by group, in the order in which they are documented and written."""
