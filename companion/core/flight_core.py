@@ -17,7 +17,7 @@ from companion.control.vehicle_control import Command, VehicleControl
 from companion.core.flight_state import Request, Tare
 from companion.core.let_go import team_state_of
 from companion.core.phase_tick import checked_reference, failed
-from companion.core.sequence import missing_inputs
+from companion.core.readiness import missing_inputs
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters, event_of
 from companion.core.verdict import verdict_of

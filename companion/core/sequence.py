@@ -6,24 +6,17 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from companion.config.vehicle import Vehicle
-from companion.core.flight_state import Tare
 from companion.core.phase_tick import PhaseFailed, advance_phase
 from companion.core.reactions import land_instead, land_now
+from companion.core.readiness import misplaced, ready, refuse, refuse_start, wait
 from companion.core.transition import Transition
 from companion.mission.active_plan import ActiveTrajectory
-from companion.mission.check import check_start
-from companion.mission.plan import Plan
-from companion.mission.settled import SettledEstimate
 from companion.model import flight_stage as seq
 from companion.model.best_pose import best_pose, pose_used_s
 from companion.model.flight_stage import Stage
-from companion.model.frames import euler_zyx_from_quat
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
-    Inputs,
-    Joints,
     Outcome,
     PhaseKind,
     SafetyAction,
@@ -32,11 +25,8 @@ from companion.model.types import (
 from companion.safety import notices, rules
 from companion.safety.autopilot_landing import FLIPPED, KILLED, TIPPED
 from companion.safety.device_rules import PILOT_TOOK_OVER
-from companion.safety.mocap import unfused
-from companion.safety.notices import EventDefinition
 from companion.safety.px4 import DISARMED_ABOVE_M
 from companion.safety.rules import CRASHED
-from companion.safety.team import strangers
 from companion.safety.touchdown import MOCAP_FRESH_S
 
 ARMED_SHOWN_S = 1.5
@@ -67,156 +57,12 @@ def advance(t: Transition) -> AutopilotRequest:
 # -- on the ground -------------------------------------------------------------------------------------------------
 
 
-def _wait(t: Transition, elapsed_s: float) -> AutopilotRequest:
-    _wait_for_readiness(t, elapsed_s)
-    if t.start_asked:
-        _decline_start(t)
-    return _NONE
-
-
-def _wait_for_readiness(t: Transition, elapsed_s: float) -> None:
-    """Wait until every input of the vehicle has arrived and PX4 has followed motion capture for the duration of the tare."""
-    i, was_ready = t.i, t.state.waiting.was_ready
-    overdue = elapsed_s > seq.WAIT_TIMEOUT_S and not was_ready
-    missing = missing_inputs(i, t.parameters.vehicle)
-    problem = _nothing_from(missing) if missing else unfused(i)
-    if problem is not None:
-        t.change_waiting(unready=problem, tare_start_s=None, settled=SettledEstimate())
-        if overdue:
-            _refuse(t, notices.INPUTS_MISSING if missing else notices.VISION_NOT_FUSED, problem)
-        return
-    if t.state.waiting.tare_start_s is None:
-        _begin_tare(t)
-    _weigh(t)
-    tare_start_s = t.state.waiting.tare_start_s
-    assert tare_start_s is not None
-    settled, tared = t.state.waiting.settled, i.t_s - tare_start_s >= seq.TARE_S
-    wanders = settled.problem(i.t_s)
-    if not tared and (wanders is None or not settled.lasted(i.t_s)):
-        t.change_waiting(unready="the vehicle has not stood still for long enough; meanwhile a force sensor is tared")
-        return
-    if wanders is not None:
-        t.change_waiting(unready=wanders)
-        if tared:  # while something moved
-            _begin_tare(t)
-        if overdue:
-            _refuse(t, notices.ESTIMATE_UNSTEADY, wanders)
-        return
-    t.tare.append(Tare.FINISH)
-    problems = _start_problems(t)
-    if not problems:
-        _is_ready(t)
-    elif was_ready:  # the vehicle was moved, and may be put back
-        t.change_waiting(unready=problems[0])
-    else:
-        _refuse_start(t, problems)
-
-
-def _is_ready(t: Transition) -> None:
-    if not t.parameters.waits_for_start:
-        _take_off(t)
-        return
-    t.change_waiting(
-        was_ready=True, unready="the vehicle has only just become ready; send the command again", looked_s=t.i.t_s
-    )
-    _begin_tare(t)
-    t.enter(Stage.READY)
-
-
-def _ready(t: Transition, _: float) -> AutopilotRequest:
-    """Wait until the operator starts the take-off or a required input is lost."""
-    i, waiting = t.i, t.state.waiting
-    missing = missing_inputs(i, t.parameters.vehicle)
-    problem = _nothing_from(missing) if missing else unfused(i)
-    if problem is None:
-        assert waiting.tare_start_s is not None
-        _weigh(t)
-        if i.t_s - waiting.tare_start_s >= seq.TARE_S:
-            t.tare.append(Tare.FINISH)
-            _begin_tare(t)
-        if t.start_asked or i.t_s - waiting.looked_s >= seq.LOOK_AGAIN_S:
-            t.change_waiting(looked_s=i.t_s)
-            problem = t.state.waiting.settled.problem(i.t_s) or next(iter(_start_problems(t)), None)
-    else:
-        t.change_waiting(settled=SettledEstimate())
-    if problem is not None:
-        t.change_waiting(unready=problem, tare_start_s=None)
-        t.report(notices.NOT_READY, f"no longer ready: {problem}")
-        t.enter(Stage.WAIT)
-        if t.start_asked:
-            _decline_start(t)
-    elif t.start_asked:
-        _take_off(t)
-    return _NONE
-
-
-def _begin_tare(t: Transition) -> None:
-    t.tare.append(Tare.BEGIN)
-    t.change_waiting(tare_start_s=t.i.t_s)
-
-
-def _weigh(t: Transition) -> None:
-    i = t.i
-    assert i.vehicle is not None
-    t.tare.append(Tare.COLLECT)
-    t.change_waiting(settled=t.state.waiting.settled.take(i.t_s, i.vehicle, i.mocap))
-
-
-def _start_problems(t: Transition) -> list[str]:
-    """Return how the vehicle's pose differs from the mission's start, and why the other vehicle of its team cannot fly with it; an
-    empty list if there is nothing, or nothing is known.
-    """
-    return _misplaced(t) + strangers(t.i, t.parameters.config.agreed)
-
-
-def _misplaced(t: Transition) -> list[str]:
-    vehicle, p = t.i.vehicle, t.parameters
-    if vehicle is None or (p.vehicle.arm.joints and t.i.arm is None):
-        return []
-    yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
-    return check_start(p.config.mission, p.vehicle, vehicle.position_world_m, yaw_rad, _arm_rad(t))
-
-
-def _take_off(t: Transition) -> None:
-    """Plan the mission from the present position and enter OFFBOARD."""
-    vehicle, p = t.i.vehicle, t.parameters
-    assert vehicle is not None
-    yaw_rad = euler_zyx_from_quat(vehicle.attitude_wxyz)[2]
-    t.change(plan=Plan.build(p.config.mission, p.vehicle, vehicle.position_world_m, yaw_rad, _arm_rad(t)))
-    t.enter(Stage.OFFBOARD)
-
-
-def _arm_rad(t: Transition) -> Joints:
-    """Return the measured joint angles, rad; empty if the vehicle has no arm."""
-    if not t.parameters.vehicle.arm.joints:
-        return ()
-    assert t.i.arm is not None
-    return t.i.arm.angle_rad
-
-
-def _decline_start(t: Transition) -> None:
-    waits = t.parameters.waits_for_start
-    text = t.state.waiting.unready if waits else "this flight takes off by itself as soon as it is ready"
-    t.report(notices.START_DECLINED, text)
-
-
-def _refuse_start(t: Transition, problems: list[str]) -> None:
-    for problem in problems:
-        t.report(notices.START_REFUSED, problem)
-    t.stand_down(Outcome.REFUSED)
-
-
-def _refuse(t: Transition, notice: EventDefinition, text: str) -> None:
-    t.report(notice, text)
-    t.stand_down(Outcome.REFUSED)
-
-
 def _offboard(t: Transition, elapsed_s: float) -> AutopilotRequest:
     # After a landing PX4 is in OFFBOARD already, but it arms only on a stream of setpoints.
     if seq.in_offboard(t.i.status) and elapsed_s > seq.STREAM_BEFORE_OFFBOARD_S:
         t.enter(Stage.ARM)
     elif elapsed_s > seq.OFFBOARD_TIMEOUT_S:
-        _refuse(t, notices.OFFBOARD_REFUSED, "PX4 did not enter OFFBOARD")
+        refuse(t, notices.OFFBOARD_REFUSED, "PX4 did not enter OFFBOARD")
     elif elapsed_s > seq.STREAM_BEFORE_OFFBOARD_S:
         return AutopilotRequest.OFFBOARD
     return _NONE
@@ -226,13 +72,13 @@ def _arm(t: Transition, elapsed_s: float) -> AutopilotRequest:
     t_s = t.i.t_s
     if seq.is_armed(t.i.status):
         assert t.state.plan is not None
-        if problems := _misplaced(t):  # since the start was commanded
-            _refuse_start(t, problems)
+        if problems := misplaced(t):  # since the start was commanded
+            refuse_start(t, problems)
             return _NONE
         t.change(course=ActiveTrajectory(t.state.plan, t_s + seq.SPOOL_S))
         t.enter(Stage.SPOOL)
     elif elapsed_s > seq.ARM_TIMEOUT_S:
-        _refuse(t, notices.ARMING_REFUSED, "PX4 did not arm")
+        refuse(t, notices.ARMING_REFUSED, "PX4 did not arm")
     else:
         t.change(arm_requested_s=t_s)
         return AutopilotRequest.ARM
@@ -386,39 +232,9 @@ def _crash(t: Transition, text: str) -> None:
         t.finish(Outcome.CRASHED)
 
 
-def missing_inputs(i: Inputs, vehicle: Vehicle) -> list[str]:
-    """Return the devices of the vehicle that have delivered no data yet."""
-    devices: dict[str, object] = {"PX4 state": i.vehicle, "PX4": i.status}
-    if vehicle.devices.mocap.external:
-        devices["PX4's ESTIMATOR_STATUS"] = i.estimator
-    else:
-        devices["motion capture"] = i.mocap
-    if vehicle.arm.joints:
-        devices["arm"] = i.arm
-    if vehicle.devices.force is not None:
-        devices["force sensor"] = i.force
-    if vehicle.jaws is not None:
-        devices["clamp"] = i.clamp
-    if vehicle.devices.team is not None:
-        partner, timeout_s = i.partner, vehicle.safety.partner_timeout_s
-        devices["other vehicle"] = None if partner is None or i.t_s - partner.stamp_s > timeout_s else partner
-    return [name for name, value in devices.items() if value is None]
-
-
-def _nothing_from(missing: list[str]) -> str:
-    hints = "".join(f"; {hint}" for device, hint in _HINTS.items() if device in missing)
-    return f"no data from: {', '.join(missing)}{hints}"
-
-
-_HINTS: Final = {
-    "PX4 state": "PX4 sends no local position: check EKF2_EV_CTRL = 11 and EKF2_HGT_REF = 3",
-    "other vehicle": "start the other vehicle, as the other member and with the same key, and check the addresses in devices.team",
-}
-
-
 _STAGES: Final[Mapping[Stage, Callable[[Transition, float], AutopilotRequest]]] = {
-    Stage.WAIT: _wait,
-    Stage.READY: _ready,
+    Stage.WAIT: wait,
+    Stage.READY: ready,
     Stage.OFFBOARD: _offboard,
     Stage.ARM: _arm,
     Stage.SPOOL: _spool,

@@ -11,7 +11,7 @@ import pytest
 
 from companion.config.devices import TeamDevice
 from companion.core.flight_state import FlightState, Tare
-from companion.core.sequence import missing_inputs
+from companion.core.readiness import missing_inputs
 from companion.mission.active_plan import ActiveTrajectory
 from companion.mission.plan import Plan
 from companion.mission.settled import SettledEstimate
