@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.analysis.animation import movie_of, player_html
-from companion.analysis.contact import rotor_distance_m, surface_error, true_force_n
+from companion.analysis.contact import contact_lines
 from companion.analysis.log import FlightLog
 from companion.analysis.page import Page, Section, write_page
 from companion.analysis.plots import write_plots
@@ -128,40 +128,10 @@ def _results(summary: dict[str, Any], stride: int, catches: bool) -> list[Table]
     return [
         pairs("RMS error", rms, *parts.values()),
         pairs("Flight", flight),
-        *_contact(summary),
+        *([pairs("Contact", contact)] if (contact := contact_lines(summary)) else []),
         *([] if clock["kind"] == "simulated" else [pairs("Timing [ms]", timing, "p50", "p99", "max")]),
         pairs("Loop and log", processes),
     ]
-
-
-def _contact(summary: dict[str, Any]) -> list[Table]:
-    contact = summary.get("contact")
-    if contact is None:
-        return []
-    surface = contact["surface"]
-    true_n = None if contact["mean_n"] is None else true_force_n(summary)
-    rows = [
-        ("force wanted", _number(contact["wanted_n"], 2, " N")),
-        ("force measured", _number(contact["mean_n"], 2, " N")),
-        *([] if true_n is None else [("true force (simulation)", f"{true_n:.2f} N")]),
-        ("force error, RMS", _number(contact["rms_error_n"], 2, " N")),
-        ("overshoot", _number(contact["overshoot_n"], 2, " N")),
-        ("touches", str(contact["touches"])),
-        ("tip from its path, RMS", _number(contact["path_rms_m"], 4, " m")),
-    ]
-    if surface is not None:
-        rows.append(("surface touched at", _vector(surface["point_m"]) + " m"))
-        if surface["points"]:
-            rows.append((f"normal by {surface['points']} points", _vector(surface["normal"])))
-        if (off := surface_error(summary)) is not None:
-            rows.append(("found surface off (simulation)", f"{1e3 * off[0]:.1f} mm, {off[1]:.1f} deg"))
-    if (distance_m := rotor_distance_m(summary)) is not None:
-        rows.append(("nearest rotor (simulation)", f"{distance_m:.2f} m"))
-    return [pairs("Contact", rows)]
-
-
-def _vector(values: Sequence[float]) -> str:
-    return ", ".join(f"{value:z.3f}" for value in values)
 
 
 def _events(events: Sequence[dict[str, Any]]) -> Table:

@@ -22,7 +22,8 @@ _NO_RMS = TrackingRms(None, None, None)
 _NO_TIMES = percentiles(np.empty(0))
 
 
-def empty_summary(
+def summarise(
+    log: FlightLog | None,
     *,
     outcome: str,
     controller: str,
@@ -30,9 +31,21 @@ def empty_summary(
     payload_kg: float | None = None,
     recorder: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return the summary of a flight that left no log; the arguments are those of `summarise`."""
-    recorder = recorder or {}
-    return {
+    """Return the summary of one flight.
+
+    Args:
+        log: log of the flight; None for a flight that left none.
+        outcome: completed, refused, aborted, crashed or lost, as determined by the launcher.
+        preset: name of the built-in or user's preset.
+        payload_kg: true mass in SITL; None on hardware.
+        recorder: the recorder's own report (samples, dropped, error); None to count from the log.
+
+    Returns:
+        The content of summary.json. Times `*_t_s` and `catch_t_s` are on the mission clock (0 at the take-off command); an
+            event's `t_s` is on the flight clock (as recorded) and comes with `mission_t_s`.
+    """
+    recorder = recorder or ({} if log is None else {"samples": log.timing.ticks, "dropped": log.missing_ticks()})
+    summary: dict[str, Any] = {
         "outcome": outcome,
         "controller": controller,
         "preset": preset,
@@ -57,39 +70,11 @@ def empty_summary(
         "graded_every": 1,
         "world": None,
         "autopilot": None,
-        "clock": {"kind": "real", "pace": None, "speed": None},
+        "clock": {"kind": "real" if log is None else log.clock, "pace": None, "speed": None},
     }
-
-
-def summarise(
-    log: FlightLog,
-    *,
-    outcome: str,
-    controller: str,
-    preset: str,
-    payload_kg: float | None = None,
-    recorder: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Return the summary of one flight.
-
-    Args:
-        outcome: completed, refused, aborted, crashed or lost, as determined by the launcher.
-        preset: name of the built-in or user's preset.
-        payload_kg: true mass in SITL; None on hardware.
-        recorder: the recorder's own report (samples, dropped, error); None to count from the log.
-
-    Returns:
-        The content of summary.json. Times `*_t_s` and `catch_t_s` are on the mission clock (0 at the take-off command); an
-            event's `t_s` is on the flight clock (as recorded) and comes with `mission_t_s`.
-    """
-    timing = log.timing
-    counted = {"samples": timing.ticks, "dropped": log.missing_ticks()}
-    summary = empty_summary(
-        outcome=outcome, controller=controller, preset=preset, payload_kg=payload_kg, recorder=recorder or counted
-    )
-    summary["clock"]["kind"] = log.clock
-    if not log.inputs:
+    if log is None or not log.inputs:
         return summary
+    timing = log.timing
     caught = metrics.catch_index(log)
     pre, post = metrics.flight_masks(log)
     position_n, arm_nm = metrics.impedance_error(log)

@@ -11,7 +11,7 @@ from rich.console import Console
 from companion.analysis.contact import PROBE, contact_lines, write_probe
 from companion.analysis.log import FlightLog, LogError
 from companion.analysis.proposal import PROPOSAL, write_proposal
-from companion.analysis.summary import empty_summary, summarise, write_summary
+from companion.analysis.summary import summarise, write_summary
 from companion.launcher.launcher import FlightResult, Launcher, Sitl
 from companion.launcher.reports import LAND_SIGNALS
 from companion.model.types import Outcome
@@ -90,14 +90,14 @@ def summary_of(
             log = FlightLog.read(path, ticks_max=TICKS_MAX)
         except LogError as error:
             print_error(error)
-    about: dict[str, Any] = {
-        "outcome": result.outcome.value,
-        "controller": config.controller.law,
-        "preset": config.controller.preset,
-        "payload_kg": result.world.get("payload_kg"),
-        "recorder": result.recorder,
-    }
-    summary = summarise(log, **about) if log is not None else empty_summary(**about)
+    summary = summarise(
+        log,
+        outcome=result.outcome.value,
+        controller=config.controller.law,
+        preset=config.controller.preset,
+        payload_kg=result.world.get("payload_kg"),
+        recorder=result.recorder,
+    )
     summary["clock"] |= {"pace": result.pace, "speed": speed if speed is None or math.isfinite(speed) else "max"}
     summary["autopilot"] = autopilot_of(log, result.world)
     knobs = result.world.get("knobs")

@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from companion.analysis import contact_plots, metrics, plot_style, plots
 from companion.analysis.log import FlightLog
 from companion.analysis.report import write_report
-from companion.analysis.summary import empty_summary, summarise, write_summary
+from companion.analysis.summary import summarise, write_summary
 from companion.model.outputs import Outputs, Sent
 from companion.model.types import Inputs, PhaseKind
 from tests.analysis.synthetic_flight import CATCH_S, CONFIG, log_of_rows, synthetic_flight
@@ -289,7 +289,7 @@ def test_every_key_is_there_whatever_is_missing(flight: FlightLog, tmp_path: Pat
     ]
     options: dict[str, Any] = {"outcome": "lost", "controller": "csc", "preset": "paper"}
     for summary in (
-        empty_summary(**options),
+        summarise(None, **options),
         summarise(made_of(bare), **options),
         summarise(made_of(bare[:1], {"vehicle": {}}), **options),
         summarise(dataclasses.replace(flight, inputs=(), outputs=(), sent=()), **options),

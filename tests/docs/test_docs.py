@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from companion.analysis.summary import empty_summary
+from companion.analysis.summary import summarise
 from companion.cli.main import _normalised, make_parser
 from companion.config.base import Model
 from companion.config.controller import PRESETS, AdaptiveConfig
@@ -251,7 +251,7 @@ def test_summary_keys_match() -> None:
         else:
             yield path
 
-    made = set(leaves(empty_summary(outcome="completed", controller="adaptive", preset="paper")))
+    made = set(leaves(summarise(None, outcome="completed", controller="adaptive", preset="paper")))
     assert {key for row in table(LOG, "key") for key in codes(row[0])} == made
 
 
