@@ -1,111 +1,62 @@
 """Checks the parts of a log's metadata that evaluations read as plain data: its configuration and planned path.
 
-The models of `companion.config` do not fit older logs, which lack keys and have others. Here every key may be absent and unknown keys
-are ignored, but a key that an evaluation reads has the expected type and a value in the expected range.
+The models of `companion.config` check the values that are there. A log of another version may lack keys, have others, and not meet the
+conditions between keys, so none of these is an error.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+import json
+from typing import Any
 
-import msgspec
-from msgspec import UNSET, Meta, UnsetType
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
-Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
-Positive = Annotated[float, Meta(ge=1e-6, le=1e6)]
-Vector = tuple[Number, Number, Number]
-Range = tuple[Number, Number]
-
-
-class _Rotor(msgspec.Struct):
-    position_body_m: Vector
-    spin: str
+from companion.config.base import Vector3
+from companion.config.document import key_path
+from companion.config.loader import Sources
+from companion.config.vehicle import Vehicle
 
 
-class _Airframe(msgspec.Struct):
-    mass_kg: Positive | UnsetType = UNSET
-    hover_thrust: Number | UnsetType | None = UNSET
-    radius_m: Positive | UnsetType = UNSET
-    ground_clearance_m: Number | UnsetType = UNSET
-    layout: str | UnsetType = UNSET
-    rotor_arm_m: Positive | UnsetType = UNSET
-    rotor_height_m: Number | UnsetType = UNSET
-    rotors: list[_Rotor] | None = None
+class _World(BaseModel):
+    """What evaluations read of the simulated world, whose models no flight imports (`companion.sitl_config`)."""
 
-
-class _Arm(msgspec.Struct):
-    joints: list[Any] | None = None
-    link_lengths_m: list[Number] | None = None
-
-
-class _Tool(msgspec.Struct):
-    length_m: Number | None = None
-    net_radius_m: Number | None = None
-    tip_radius_m: Number | None = None
-
-
-class _Tether(msgspec.Struct):
-    anchor_world_m: Vector | UnsetType = UNSET
-    attachment_body_m: Vector | UnsetType = UNSET
-    length_m: Number | UnsetType = UNSET
-    margin_m: Number | UnsetType = UNSET
-    taut_slack_m: Number | UnsetType = UNSET
-
-
-class _Room(msgspec.Struct):
-    x_m: Range
-    y_m: Range
-    z_m: Range
-
-
-class _Safety(msgspec.Struct):
-    force_timeout_s: Number | UnsetType = UNSET
-
-
-class _Vehicle(msgspec.Struct):
-    name: str | UnsetType = UNSET
-    airframe: _Airframe | UnsetType = UNSET
-    arm: _Arm | None = None
-    tool: _Tool | None = None
-    tether: _Tether | None = None
-    room: _Room | UnsetType = UNSET
-    safety: _Safety | UnsetType = UNSET
-    devices: dict[str, dict[str, Any] | None] | UnsetType = UNSET
-
-
-class _Mission(msgspec.Struct):
-    name: str | UnsetType = UNSET
-    phases: list[dict[str, Any]] | None = None
-
-
-class _Sources(msgspec.Struct):
-    vehicle: str | None = None
-    overrides: list[str] | None = None
-
-
-class _World(msgspec.Struct):
-    name: str | UnsetType = UNSET
+    name: str | None = None
     seed: int | None = None
-    model_error: Number | None = None
-    payload_kg: Number | None = None
-    throw_velocity_m_s: Vector | None = None
+    model_error: float | None = None
+    payload_kg: float | None = None
+    throw_velocity_m_s: Vector3 | None = None
 
 
-class _Config(msgspec.Struct):
-    vehicle: _Vehicle | UnsetType = UNSET
-    mission: _Mission | UnsetType = UNSET
-    controller: dict[str, Any] | UnsetType = UNSET
-    sources: _Sources | None = None
-    world: _World | None = None
+_MODELS: dict[str, type[BaseModel]] = {"vehicle": Vehicle, "sources": Sources, "world": _World}
+_OBJECTS = (*_MODELS, "mission", "controller")
+_OF_OTHER_VERSIONS = {"missing", "extra_forbidden", "condition", "value_error"}
+_LARGEST = 1e12
+"""No quantity of a flight is larger; drawing one would overflow."""
+_PATH = TypeAdapter(list[Vector3])
 
 
 def checked_config(config_json: str) -> dict[str, Any]:
-    """Return the effective configuration of a log as plain nested data.
+    """Return the effective configuration of a log as plain nested data; that of the simulated world is in older logs only.
 
     Raises:
-        ValueError: the text is not JSON, or a key that evaluations read has another type or is out of range; the text names it.
+        ValueError: the text is not JSON, or a value has another type or is out of range; the text names its key.
     """
-    return dict(_checked(config_json, _Config))
+    config = _parsed(config_json)
+    if not isinstance(config, dict):
+        raise ValueError("expected an object")
+    for name in _OBJECTS:
+        if not isinstance(config.get(name, {}), dict):
+            raise ValueError(f"{name}: expected an object")
+    for name in _MODELS.keys() & config.keys():
+        try:
+            _MODELS[name].model_validate_json(json.dumps(config[name]), strict=True)
+        except ValidationError as error:
+            for found in error.errors():
+                location = (name, *found["loc"])
+                of_a_tuple = found["type"] == "missing" and isinstance(location[-1], int)
+                if of_a_tuple or found["type"] not in _OF_OTHER_VERSIONS:
+                    raise ValueError(f"{key_path(location)}: {found['msg']}") from None
+    return config
 
 
 def checked_path(path_json: str) -> list[list[float]]:
@@ -114,13 +65,21 @@ def checked_path(path_json: str) -> list[list[float]]:
     Raises:
         ValueError: the text is not JSON, or not a list of points.
     """
-    return list(_checked(path_json, list[Vector]))
-
-
-def _checked(text: str, kind: Any) -> Any:
+    path = _parsed(path_json)
     try:
-        data = msgspec.json.decode(text)
-        msgspec.convert(data, kind)
+        _PATH.validate_python(path)
+    except ValidationError:
+        raise ValueError("expected a list of points") from None
+    return list(path)
+
+
+def _parsed(text: str) -> Any:
+    def number(digits: str) -> float:
+        if not abs(value := float(digits)) <= _LARGEST:
+            raise ValueError(f"{digits[:40]} is too large for a quantity of a flight")
+        return value
+
+    try:
+        return json.loads(text, parse_float=number, parse_constant=number)
     except RecursionError:
         raise ValueError("its JSON is nested too deeply") from None
-    return data

@@ -105,7 +105,7 @@ def text_of(record: str, key: str, text: str) -> Callable[[Metadata], object]:
         (config_with("vehicle.airframe", None), "vehicle.airframe"),
         (config_with("vehicle.airframe.mass_kg", 0), "vehicle.airframe.mass_kg"),
         (config_with("vehicle.airframe.mass_kg", float("nan")), "'config'"),
-        (config_with("vehicle.airframe.radius_m", 1e308), "vehicle.airframe.radius_m"),
+        (config_with("vehicle.airframe.radius_m", 1e308), "1e+308"),
         (config_with("vehicle.airframe.ground_clearance_m", "0.2"), "vehicle.airframe.ground_clearance_m"),
         (config_with("vehicle.arm.joints", 2), "vehicle.arm.joints"),
         (config_with("vehicle.tool.net_radius_m", "wide"), "vehicle.tool.net_radius_m"),
