@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from companion.preflight import arm, estimator, force, frames, machine, mission, mocap, px4, tether
 from companion.preflight.checks import Check
-from tools.docs.tables import write_page
+from tools.docs.tables import markdown, write_generated
 
 ROOMS: dict[str, Sequence[Check]] = {
     "px4": (*px4.CHECKS, *estimator.CHECKS),
@@ -25,11 +23,8 @@ ROOMS: dict[str, Sequence[Check]] = {
 
 def checks_table(checks: Sequence[Check]) -> str:
     """Return a table with one row per check."""
-    lines = ["| row | quantity | expected | consequence of a failure |", "|---|---|---|---|"]
-    for check in checks:
-        consequence = f"{check.why}{' (warns only)' if check.warns else ''}"
-        lines.append(f"| `{check.id}` | {check.title} | {check.wanted} | {consequence} |")
-    return "\n".join(lines)
+    rows = ((f"`{c.id}`", c.title, c.wanted, f"{c.why}{' (warns only)' if c.warns else ''}") for c in checks)
+    return markdown(("row", "quantity", "expected", "consequence of a failure"), rows)
 
 
 def tables() -> dict[str, str]:
@@ -37,12 +32,5 @@ def tables() -> dict[str, str]:
     return {name: checks_table(checks) for name, checks in ROOMS.items()}
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Write the tables into a page; return the exit code."""
-    parser = argparse.ArgumentParser(prog="tools.docs.preflight", description=__doc__)
-    parser.add_argument("page", type=Path)
-    return write_page(parser.parse_args(argv).page, tables())
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(write_generated("tools.docs.preflight", tables()))

@@ -13,7 +13,7 @@ from companion.preflight.px4 import text_of
 from companion.px4 import params_file
 from companion.px4.required import GROUPS, NO_RADIO, RADIO, file_values
 from companion.px4.versions import varies, which
-from tools.docs.tables import written
+from tools.docs.tables import markdown, written
 
 NO_RADIO_FILE = "no_radio.params"
 DOCS_MARK = "parameters"
@@ -55,23 +55,19 @@ def no_radio_text() -> str:
 
 def table_markdown() -> str:
     """Return the table of parameters for docs/internals/px4.md."""
-    lines = []
+    blocks = []
     for title, group in GROUPS.items():
-        lines += [
-            f"**{title}**",
-            "",
-            "| parameter | set | accepted | if not | reboot | reason |",
-            "|---|---|---|---|---|---|",
-        ]
+        rows = []
         for wanted in group:
             value = "measured" if wanted.value is None else f"`{text_of(wanted.value)}`"
             if not wanted.file and wanted.value is not None:
                 value += " without a radio"
             reboot = "yes" if wanted.reboot else ""
             name = f"`{wanted.name}` ({which(wanted.name)})" if varies(wanted.name) else f"`{wanted.name}`"
-            lines.append(f"| {name} | {value} | {wanted.text()} | {wanted.level.value} | {reboot} | {wanted.why} |")
-        lines.append("")
-    return "\n".join(lines).rstrip()
+            rows.append((name, value, wanted.text(), wanted.level.value, reboot, wanted.why))
+        head = ("parameter", "set", "accepted", "if not", "reboot", "reason")
+        blocks.append(f"**{title}**\n\n{markdown(head, rows)}")
+    return "\n\n".join(blocks)
 
 
 def main(root: Path) -> None:

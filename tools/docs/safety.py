@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import re
 import sys
-from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel
@@ -18,7 +16,7 @@ from companion.safety.notices import HOLD_EXPIRED, NO_ROOM_TO_STAY, NOTICES, RET
 from companion.safety.rule import Repeat, Rule, Subject
 from companion.safety.rules import RULES
 from companion.safety.supervisor import EscalationTimeouts, SupervisorState, update
-from tools.docs.tables import write_page
+from tools.docs.tables import markdown, write_generated
 
 _SECTIONS: dict[str, type[BaseModel]] = {"": Safety, "tether.": Tether, "devices.force.": ForceDevice}
 _TIMES = EscalationTimeouts(1.0, 1.0)
@@ -47,12 +45,10 @@ def _message(rule: Rule) -> str:
 
 def monitors_table() -> str:
     """Return the table of rules by subject, with one row per rule in the order of the code."""
-    rows = [
-        "| id | what is found | thresholds | hold time | on the ground | in the air | message |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    head = ("id", "what is found", "thresholds", "hold time", "on the ground", "in the air", "message")
+    rows: list[tuple[str, ...]] = []
     for subject in Subject:
-        rows.append(f"| **{subject.value}** | | | | | | |")
+        rows.append((f"**{subject.value}**", *[""] * (len(head) - 1)))
         for rule in RULES:
             if rule.subject is subject:
                 cells = (
@@ -65,8 +61,8 @@ def monitors_table() -> str:
                     + ("; while the pilot is flying, only an event, no command to PX4" if rule.pilot_flies else ""),
                     _message(rule),
                 )
-                rows.append(f"| {' | '.join(cells)} |")
-    return "\n".join(rows)
+                rows.append(cells)
+    return markdown(head, rows)
 
 
 def after(state: SafetyAction, event_id: str, asks: SafetyAction) -> SafetyAction:
@@ -92,18 +88,13 @@ def ladder_table() -> str:
         end = update(SupervisorState(start, "before", 0.0), [], 2.0, _TIMES)
         shown = tuple(end.action.value if state is start else "" for state in states)
         effects.setdefault(shown, []).append(f"`{notice.id}`, after {_default(key)} s")
-    return "\n".join(
-        [
-            f"| {' | '.join(state.value for state in states)} | events |",
-            f"|{'---|' * len(states)}---|",
-            *(f"| {' | '.join(shown)} | {', '.join(ids)} |" for shown, ids in effects.items()),
-        ]
-    )
+    rows = ((*shown, ", ".join(ids)) for shown, ids in effects.items())
+    return markdown((*(state.value for state in states), "events"), rows)
 
 
 def notices_table() -> str:
     """Return the table of notices, with one row per notice."""
-    return "\n".join(["| id | when |", "|---|---|", *(f"| `{notice.id}` | {notice.when} |" for notice in NOTICES)])
+    return markdown(("id", "when"), ((f"`{notice.id}`", notice.when) for notice in NOTICES))
 
 
 def tables() -> dict[str, str]:
@@ -111,12 +102,5 @@ def tables() -> dict[str, str]:
     return {"monitors": monitors_table(), "notices": notices_table(), "ladder": ladder_table()}
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Write the tables into a page; return the exit code."""
-    parser = argparse.ArgumentParser(prog="tools.docs.safety", description=__doc__)
-    parser.add_argument("page", type=Path)
-    return write_page(parser.parse_args(argv).page, tables())
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(write_generated("tools.docs.safety", tables()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import sys
@@ -40,6 +41,13 @@ def write_page(page: Path, tables: Mapping[str, str]) -> int:
         print(f"{page}: {error}", file=sys.stderr)
         return 2
     return 0
+
+
+def write_generated(program: str, tables: Mapping[str, str]) -> int:
+    """Write tables that are made from the code into the page that the command line names; return an exit code."""
+    parser = argparse.ArgumentParser(prog=program, description="Write the tables of a page from the code.")
+    parser.add_argument("page", type=Path)
+    return write_page(parser.parse_args().page, tables)
 
 
 def flown_by(results: Mapping[str, Any]) -> str:
