@@ -10,7 +10,6 @@ Lambda + M_d Phi that the paper's printed gains give its own law.
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Sequence
@@ -19,10 +18,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.report import publish, table_parser
 from companion.analysis import metrics
-from companion.recorder.versions import versions
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import fly_to_end, log_of, with_world
+from tools.docs.tables import markdown
 
 MISSION = Path(__file__).parents[1] / "configs" / "missions" / "catch.yaml"
 FLIGHT_S = 11.0
@@ -63,23 +63,22 @@ def errors(name: str, world: str, seed: int) -> tuple[float, float, float]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the table and return 0."""
-    parser = argparse.ArgumentParser(description="Show the errors before the catch beside the paper's.")
+    parser = table_parser("Show the errors before the catch beside the paper's.")
     parser.add_argument("--world", default="lab", help="lab, ideal or a world file (%(default)s)")
     parser.add_argument("--laboratories", type=int, default=20, help="flights per law (%(default)s)")
     parser.add_argument("--first", type=int, default=1, help="seed of the first laboratory (%(default)s)")
-    parser.add_argument("--jobs", type=int, default=2, help="processes (%(default)s)")
     a = parser.parse_args(arguments)
     flights = [(name, a.world, seed) for name in LAWS for seed in range(a.first, a.first + a.laboratories)]
     with ProcessPoolExecutor(a.jobs) as pool:
         flown = np.array(list(pool.map(errors, *zip(*flights, strict=True)))).reshape(len(LAWS), a.laboratories, 3)
-    print("| law | e_p, mm: p50 (p5 to p95) | e_q, deg | attitude from level, deg | paper: e_p, mm | paper: e_q, deg |")
-    print("|---|---|---|---|---|---|")
-    for (name, (*_, paper_mm, paper_deg)), rows in zip(LAWS.items(), flown, strict=True):
-        p5, p50, p95 = np.nanpercentile(rows[:, 0], (5, 50, 95))
-        e_q, level = np.nanmedian(rows[:, 1:], axis=0)
-        print(f"| {name} | {p50:.0f} ({p5:.0f} to {p95:.0f}) | {e_q:.1f} | {level:.1f} | {paper_mm} | {paper_deg} |")
-    command = f"python -m benchmarks.calibration --world {a.world} --laboratories {a.laboratories} --first {a.first}"
-    print(f"\nFlown by `{command}` at {versions().get('git', 'unknown')[:10]}.")
+    rows = []
+    for (name, (*_, paper_mm, paper_deg)), found in zip(LAWS.items(), flown, strict=True):
+        p5, p50, p95 = np.nanpercentile(found[:, 0], (5, 50, 95))
+        e_q, level = np.nanmedian(found[:, 1:], axis=0)
+        rows.append((name, f"{p50:.0f} ({p5:.0f} to {p95:.0f})", f"{e_q:.1f}", f"{level:.1f}", paper_mm, paper_deg))
+    ours = ("law", "e_p, mm: p50 (p5 to p95)", "e_q, deg", "attitude from level, deg")
+    command = f"calibration --world {a.world} --laboratories {a.laboratories} --first {a.first}"
+    publish(markdown((*ours, "paper: e_p, mm", "paper: e_q, deg"), rows) + "\n", command, a.table)
     return 0
 
 

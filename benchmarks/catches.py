@@ -14,12 +14,13 @@ import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+from benchmarks.report import publish
 from companion.config.document import ConfigError
 from companion.config.shipped import DEFAULT_MISSION
 from companion.model.types import Event
-from companion.recorder.versions import versions
 from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import fly_to_end, with_world
+from tools.docs.tables import markdown
 
 PAYLOADS_KG = (0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.8)
 UNTIL_S = 9.0
@@ -45,10 +46,10 @@ def counts_of(events: Sequence[Event], caught_t_s: float | None) -> Counter[str]
 def table(counted: Mapping[float, Counter[str]]) -> str:
     """Return the counts by payload in kg as a Markdown table."""
     heads = ("laboratories", "caught", "false", "undetected")
-    lines = ["| payload | " + " | ".join(heads) + " |", "|---" * (1 + len(heads)) + "|"]
-    for payload_kg, count in sorted(counted.items()):
-        lines.append(f"| {payload_kg:g} kg | " + " | ".join(str(count[head]) for head in heads) + " |")
-    return "\n".join(lines) + "\n"
+    rows = [
+        (f"{payload_kg:g} kg", *(str(count[head]) for head in heads)) for payload_kg, count in sorted(counted.items())
+    ]
+    return markdown(("payload", *heads), rows) + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -72,8 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"laboratory {seed}, {payload_kg:g} kg: {flown.error or dict(count)}", file=sys.stderr, flush=True)
         counted.setdefault(payload_kg, Counter()).update(count)
     changes = f" --set {' '.join(a.set)}" if a.set else ""
-    command = f"python -m benchmarks.catches --laboratories {a.laboratories} --first-seed {a.first_seed}{changes}"
-    print(f"{table(counted)}\nFlown by `{command}` at commit {versions().get('git', 'unknown')[:10]}.")
+    publish(table(counted), f"catches --laboratories {a.laboratories} --first-seed {a.first_seed}{changes}")
     return 0
 
 

@@ -11,7 +11,6 @@ about the effects before and after it.
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Mapping, Sequence
@@ -21,12 +20,12 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.report import add_laws, laws_of, publish, table_parser
 from companion.analysis.plot_style import COLOURS, INK, dress, figure_legend, new_figure, write_png
-from companion.config.document import ConfigError
-from companion.recorder.versions import versions
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from companion.sitl_config.world import World
 from sitl.campaigns.flights import fly_to_end, row_of, with_world
+from tools.docs.tables import markdown
 
 MISSION = Path(__file__).parents[1] / "configs" / "missions" / "catch.yaml"
 PAYLOADS_KG = (0.1, 0.2, 0.3)
@@ -94,11 +93,11 @@ def table(flown: Mapping[str, Errors], seeds: Sequence[int]) -> str:
     shown = {f"{law}, mm": errors for law, errors in flown.items()}
     shown |= {f"{law} - {first}, mm": flown[law] - flown[first] for law in others}
     columns = {title: added_mm(errors, seeds) for title, errors in shown.items()}
-    lines = ["| effect | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
-    for name in (IDEAL, *EFFECTS, LABORATORY):
-        cells = [f"{mean:+.1f} ± {half:.1f}" for mean, half in (column[name] for column in columns.values())]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    rows = [
+        (name, *(f"{mean:+.1f} ± {half:.1f}" for mean, half in (column[name] for column in columns.values())))
+        for name in (IDEAL, *EFFECTS, LABORATORY)
+    ]
+    return markdown(("effect", *columns), rows) + "\n"
 
 
 def draw(flown: Mapping[str, Errors], seeds: Sequence[int], path: Path) -> None:
@@ -122,32 +121,18 @@ def draw(flown: Mapping[str, Errors], seeds: Sequence[int], path: Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return 0, or 2 on bad input."""
-    parser = argparse.ArgumentParser(description="Add the effects of the laboratory one after the other.")
-    parser.add_argument(
-        "--laws", default="adaptive/recommended,psc/tuned,csc/tuned", help="law/preset, ... (%(default)s)"
-    )
-    parser.add_argument("--laboratories", type=int, default=40, help="orders of the effects (%(default)s)")
-    parser.add_argument("--jobs", type=int, default=2, help="processes (%(default)s)")
-    parser.add_argument("--table", type=Path, help="Markdown file to write; absent: standard output")
+    parser = table_parser("Add the effects of the laboratory one after the other.")
+    add_laws(parser, "adaptive/recommended,psc/tuned,csc/tuned", 40)
     parser.add_argument("--picture", type=Path, help="PNG file to write")
     a = parser.parse_args(arguments)
-    laws, seeds = a.laws.split(","), range(1, a.laboratories + 1)
-    try:
-        loaded = {law: load_sitl(MISSION, None, *law.split("/", 1), world="lab") for law in laws}
-    except ConfigError as error:
-        print(f"effects: {error}", file=sys.stderr)
-        return 2
+    loaded, seeds = laws_of("effects", a.laws, MISSION), range(1, a.laboratories + 1)
+    laws = list(loaded)
     ideal = load_sitl(MISSION, world="ideal").world
     flights = [(law, seed, number) for law in laws for seed in seeds for number in range(len(EFFECTS) + 1)]
     with ProcessPoolExecutor(a.jobs) as pool:
         errors = np.array(list(pool.map(partial(fly, loaded, ideal), flights, chunksize=4)))
     flown = dict(zip(laws, errors.reshape(len(laws), len(seeds), -1), strict=True))
-    command = f"python -m benchmarks.effects --laws {a.laws} --laboratories {a.laboratories}"
-    text = table(flown, seeds) + f"\nFlown by `{command}` at commit {versions().get('git', 'unknown')[:10]}.\n"
-    if a.table is None:
-        print(text, end="")
-    else:
-        a.table.write_text(text, encoding="utf-8")
+    publish(table(flown, seeds), f"effects --laws {a.laws} --laboratories {a.laboratories}", a.table)
     if a.picture is not None:
         draw(flown, seeds, a.picture)
     return 0

@@ -9,7 +9,6 @@ compliance: of the base along x under a push along x, of a joint under the torqu
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -19,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.ticker import NullFormatter
 
+from benchmarks.report import publish, table_parser
 from companion.analysis.plot_style import COLOURS, DASHED, REFERENCE, dress, figure_legend, new_figure, write_png
 from companion.config.controller import AdaptiveConfig
 from companion.control.arm_model import manipulator_of
@@ -27,11 +27,11 @@ from companion.model.types import Vec3
 from companion.phases.arm import ArmMove
 from companion.phases.hold import Hold
 from companion.phases.takeoff import Takeoff
-from companion.recorder.versions import versions
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from companion.sitl_config.world import Push
 from sitl.fast.loop import FastFlight
 from sitl.faults.timing import ARMED_SEEN_S
+from tools.docs.tables import markdown
 
 COMPLIANT = "with base rows"
 """Added to a law's name: its base answers to the measured force, which is not fed forward then."""
@@ -145,10 +145,7 @@ def wanted(law: str) -> dict[str, Array]:
 
 def table(laws: Mapping[str, tuple[dict[str, Array], dict[str, Array]]]) -> str:
     """Return measured compliances, and in brackets their ratio to the wanted ones, as a Markdown table."""
-    lines = [
-        "| | law/preset | " + " | ".join(f"{hz:g} Hz" for hz in TABLE_HZ) + " |",
-        "|---" * (2 + len(TABLE_HZ)) + "|",
-    ]
+    rows = []
     for pane in PANES:
         scale, unit = (1e3, "mm/N") if pane == PANES[0] else (1.0, "rad/(N m)")
         for law, (flown, asked) in laws.items():
@@ -156,8 +153,8 @@ def table(laws: Mapping[str, tuple[dict[str, Array], dict[str, Array]]]) -> str:
             for at in [int(np.argmin(np.abs(FREQUENCIES_HZ - hz))) for hz in TABLE_HZ]:
                 ratio = f" ({flown[pane][at] / asked[pane][at]:.2f})" if pane in asked else ""
                 cells.append(f"{scale * flown[pane][at]:.3g}{ratio}")
-            lines.append(f"| {pane}, {unit} | {law} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+            rows.append((f"{pane}, {unit}", law, *cells))
+    return markdown(("", "law/preset", *(f"{hz:g} Hz" for hz in TABLE_HZ)), rows) + "\n"
 
 
 def draw(laws: Mapping[str, tuple[dict[str, Array], dict[str, Array]]], path: Path) -> None:
@@ -184,23 +181,14 @@ def draw(laws: Mapping[str, tuple[dict[str, Array], dict[str, Array]]], path: Pa
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line, fly, and write table and picture."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--jobs", type=int, default=2, help="processes (%(default)s)")
-    parser.add_argument("--table", type=Path, help="Markdown file to write; absent: standard output")
+    parser = table_parser((__doc__ or "").partition("\n")[0])
     parser.add_argument("--picture", type=Path, help="PNG file to write")
     a = parser.parse_args(arguments)
     flights = [(law, force) for law in LAWS for force in (None, FORWARD, DOWN)]
     with ProcessPoolExecutor(a.jobs) as pool:
         flown = list(pool.map(fly, *zip(*flights, strict=True)))
     laws = {law: (measured(law, *flown[3 * k : 3 * k + 3]), wanted(law)) for k, law in enumerate(LAWS)}
-    text = (
-        table(laws)
-        + f"\nFlown by `python -m benchmarks.impedance` at commit {versions().get('git', 'unknown')[:10]}.\n"
-    )
-    if a.table is None:
-        print(text, end="")
-    else:
-        a.table.write_text(text, encoding="utf-8")
+    publish(table(laws), "impedance", a.table)
     if a.picture is not None:
         draw(laws, a.picture)
     return 0

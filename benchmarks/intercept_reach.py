@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from benchmarks.report import print_table, write_json
+from benchmarks.report import commit, print_table, write_json
 from companion.analysis.plot_style import COLOURS, INK, SOFT, dress, figure_legend, new_figure, write_png, write_svg
 from companion.config.document import ConfigError
 from companion.control.arm_model import manipulator_of
@@ -44,7 +44,6 @@ from companion.phases.intercept.motion import Bounds, State
 from companion.phases.intercept.net import opening
 from companion.phases.intercept.phase import Intercept
 from companion.phases.intercept.rotors import clearance_m
-from companion.recorder.versions import versions
 from companion.safety.governor import SafeSet
 from companion.sitl_config.loader import SitlConfig, load_sitl
 from sitl.campaigns.flights import limit_s, row_of, with_world
@@ -316,7 +315,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for suffix in ("svg", "png"):
         if throw is not None:
             draw(config, flown, throw, a.out / f"intercept_reach.{suffix}")
-    print(f"Flown at commit {versions().get('git', 'unknown')[:10]}.")
+    print(f"Flown at commit {commit()}.")
     return 0
 
 

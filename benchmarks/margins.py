@@ -9,22 +9,20 @@ the same.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from benchmarks.effects import MISSION, PAYLOADS_KG
-from companion.config.document import ConfigError
-from companion.recorder.versions import versions
-from companion.sitl_config.loader import SitlConfig, load_sitl
+from benchmarks.report import add_laws, laws_of, publish, table_parser
+from companion.sitl_config.loader import SitlConfig
 from sitl.campaigns.flights import fly_to_end, row_of, with_world
+from tools.docs.tables import markdown
 
 DELAYS_MS = tuple(range(10, 151, 10))
 LIMIT_M = 0.1
@@ -53,10 +51,7 @@ def margin(flown: Mapping[int, Sequence[Flown]]) -> tuple[int | None, int | None
 
 def table(flown: Mapping[str, Mapping[int, Sequence[Flown]]]) -> str:
     """Return one line per law as a Markdown table."""
-    lines = [
-        "| law/preset | e_p after, mm | delay margin, ms | largest e_p one step later, m | what became of those flights |",
-        "|---|---|---|---|---|",
-    ]
+    rows = []
     for law, by_delay in flown.items():
         last, beyond = margin(by_delay)
         after_mm = 1e3 * float(np.median([after for _, _, after in by_delay[min(by_delay)] if np.isfinite(after)]))
@@ -67,38 +62,23 @@ def table(flown: Mapping[str, Mapping[int, Sequence[Flown]]]) -> str:
         text = (
             f"above {max(by_delay)}" if beyond is None else f"{last}" if last is not None else f"below {min(by_delay)}"
         )
-        lines.append(f"| {law} | {after_mm:.0f} | {text} | {peak_text} | {ended or '–'} |")
-    return "\n".join(lines) + "\n"
+        rows.append((law, f"{after_mm:.0f}", text, peak_text, ended or "–"))
+    largest, became = "largest e_p one step later, m", "what became of those flights"
+    return markdown(("law/preset", "e_p after, mm", "delay margin, ms", largest, became), rows) + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return 0, or 2 on bad input."""
-    parser = argparse.ArgumentParser(description="Fly each law with more and more delay of its setpoints.")
-    parser.add_argument(
-        "--laws",
-        default="adaptive/recommended,adaptive/model_free,psc/tuned,csc/tuned",
-        help="law/preset, ... (%(default)s)",
-    )
-    parser.add_argument("--laboratories", type=int, default=6, help="flights per law and delay (%(default)s)")
-    parser.add_argument("--jobs", type=int, default=2, help="processes (%(default)s)")
-    parser.add_argument("--table", type=Path, help="Markdown file to write; absent: standard output")
+    parser = table_parser("Fly each law with more and more delay of its setpoints.")
+    add_laws(parser, "adaptive/recommended,adaptive/model_free,psc/tuned,csc/tuned", 6)
     a = parser.parse_args(arguments)
-    laws, seeds = a.laws.split(","), range(1, a.laboratories + 1)
-    try:
-        loaded = {law: load_sitl(MISSION, None, *law.split("/", 1), world="lab") for law in laws}
-    except ConfigError as error:
-        print(f"margins: {error}", file=sys.stderr)
-        return 2
+    loaded, seeds = laws_of("margins", a.laws, MISSION), range(1, a.laboratories + 1)
+    laws = list(loaded)
     flights = list(itertools.product(laws, DELAYS_MS, seeds))
     with ProcessPoolExecutor(a.jobs) as pool:
         results = dict(zip(flights, pool.map(partial(fly, loaded), flights, chunksize=4), strict=True))
     flown = {law: {delay: [results[law, delay, seed] for seed in seeds] for delay in DELAYS_MS} for law in laws}
-    command = f"python -m benchmarks.margins --laws {a.laws} --laboratories {a.laboratories}"
-    text = table(flown) + f"\nFlown by `{command}` at commit {versions().get('git', 'unknown')[:10]}.\n"
-    if a.table is None:
-        print(text, end="")
-    else:
-        a.table.write_text(text, encoding="utf-8")
+    publish(table(flown), f"margins --laws {a.laws} --laboratories {a.laboratories}", a.table)
     return 0
 
 

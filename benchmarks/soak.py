@@ -22,10 +22,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from benchmarks.report import write_json
-from benchmarks.soaking.lateness import Minute, Ticks, read_minutes, run_empty_loop, ticks_of_log
+from benchmarks.soaking.lateness import Minute, Ticks, ticks_of_log
 from benchmarks.soaking.processes import family, pss_mb, usage
 from benchmarks.soaking.verdict import (
     MEMORY_GROWTH_MAX,
@@ -42,6 +43,7 @@ from companion.mission.plan import Plan
 
 MISSION = Path(__file__).parents[1] / "configs/missions/soak.yaml"
 SAMPLE_S = 1.0
+EMPTY_LOOP = "empty_loop.npy"
 PSS_EVERY = 10
 """Samples between two readings of PSS, for which the kernel walks all pages and may delay the process."""
 BATTERY_MARGIN = 5.0
@@ -78,7 +80,7 @@ def fly(minutes: float, overrides: Sequence[str], folder: Path, console: Console
         *("--out", str(folder / "flight"), "--set", *settings),
     ]
     console.print(f"{count} repetitions, {planned_s / 60.0:.1f} minutes; {folder}", highlight=False, soft_wrap=True)
-    empty_command = [sys.executable, "-m", "benchmarks.soak", "--empty-loop", str(folder / "empty_loop.json")]
+    empty_command = [sys.executable, "-m", "benchmarks.measuring.beside", "empty", str(folder / EMPTY_LOOP)]
     with (folder / "fly.txt").open("wb") as out, (folder / "samples.jsonl").open("w") as samples:
         empty = subprocess.Popen(empty_command)
         flight = subprocess.Popen(command, stdout=out, stderr=out, env={**os.environ, "PYTHONUNBUFFERED": "1"})
@@ -146,7 +148,7 @@ def judge(folder: Path, console: Console) -> dict[str, Any]:
     world = json.loads((flown / "world.json").read_text())
     config = json.loads((flown / "config.json").read_text())
     heard = _HEARD.search((flown / "guardian.log").read_text())
-    empty = json.loads((folder / "empty_loop.json").read_text())
+    empty = Ticks.of(*np.load(folder / EMPTY_LOOP))
     with console.status("reading the log"):
         ticks = ticks_of_log(flown / "flight.mcap")
     flew = airborne(samples)
@@ -173,9 +175,9 @@ def judge(folder: Path, console: Console) -> dict[str, Any]:
         "rms": summary["rms"],
         "growth": [asdict(row) for row in growth],
         "lateness": [asdict(minute) for minute in ticks.minutes],
-        "empty_loop": empty,
+        "empty_loop": asdict(empty),
     }
-    return {**result, "problems": problems_of(result, growth, ticks, read_minutes(empty["minutes"]))}
+    return {**result, "problems": problems_of(result, growth, ticks, empty.minutes)}
 
 
 def problems_of(result: dict[str, Any], growth: Sequence[Growth], ticks: Ticks, empty: Sequence[Minute]) -> list[str]:
@@ -200,7 +202,7 @@ def problems_of(result: dict[str, Any], growth: Sequence[Growth], ticks: Ticks, 
 def show(result: dict[str, Any], folder: Path, plot: Path | None, console: Console) -> None:
     """Print tables and counts, and draw the plot."""
     flight = [Minute(**row) for row in result["lateness"]]
-    empty = read_minutes(result["empty_loop"]["minutes"])
+    empty = [Minute(**row) for row in result["empty_loop"]["minutes"]]
     print_tables(console, [Growth(**row) for row in result["growth"]], flight, empty)
     for name in (
         *("repetitions", "minutes", "outcome", "throws", "catches", "catches_noticed", "left_noticed", "warnings"),
@@ -228,11 +230,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--read", type=Path, help="evaluate the folder of an earlier run, without a flight")
     parser.add_argument("--json", type=Path, help="write the figures here as well")
     parser.add_argument("--plot", type=Path, help="draw memory and lateness over time as a PNG")
-    parser.add_argument("--empty-loop", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args(argv)
-    if arguments.empty_loop is not None:
-        run_empty_loop(arguments.empty_loop)
-        return 0
     console = Console(width=100)
     folder: Path = arguments.read or arguments.out or Path("flights") / f"{time.strftime('%Y%m%d-%H%M%S')}-soak"
     if arguments.read is None:

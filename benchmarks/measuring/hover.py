@@ -28,7 +28,6 @@ from benchmarks.measuring.hovering import (
     output_path,
     start_hover,
 )
-from benchmarks.measuring.late import alone_late
 from benchmarks.measuring.latency import RATE_HZ, Latency
 from benchmarks.soaking.processes import Usage, family, threads, usage
 from benchmarks.soaking.verdict import ROLES as FLIGHT_ROLES
@@ -44,6 +43,8 @@ BARE_LEAD_S = 12.0
 """The bare loop is shorter than the hover by this time, so that it ends before the landing."""
 SAMPLE_S = 1.0
 SAY_EVERY = 30
+WITHIN_S = 0.1
+"""A stall of the whole computer delays both loops within this time of each other."""
 EMPTY, BARE = "empty loop", "bare loop"
 ROLES = (*FLIGHT_ROLES, EMPTY, BARE)
 
@@ -246,15 +247,14 @@ def _judge(
 
 
 def late_alone(start_s: Array, late_s: Array, beside_start_s: Array, beside_late_s: Array) -> list[float]:
-    """Return the lateness of ticks that began later than two periods while no tick of the loop beside was later than one, because a
-    stall of the computer meets the two loops at different points of their periods.
-
-    Returns:
-        Lateness of each of these ticks, s.
+    """Return the lateness, s, of ticks that began later than two periods while no tick of the loop beside was later than one within
+    `WITHIN_S`, because a stall of the computer meets the two loops at different points of their periods.
     """
-    late = {float(t): float(by) for t, by in zip(start_s, late_s, strict=True) if by > 2.0 * TICK_PERIOD_S}
-    beside = [float(t) for t, by in zip(beside_start_s, beside_late_s, strict=True) if by > TICK_PERIOD_S]
-    return [late[t] for t in alone_late(list(late), beside)]
+    beside_s = beside_start_s[beside_late_s > TICK_PERIOD_S]
+    late = late_s > 2.0 * TICK_PERIOD_S
+    together = np.searchsorted(beside_s, start_s + WITHIN_S, "right") > np.searchsorted(beside_s, start_s - WITHIN_S)
+    alone: list[float] = late_s[late & ~together].tolist()
+    return alone
 
 
 def _ticks(start_s: Array, late_s: Array) -> Figures:

@@ -7,7 +7,6 @@ import pytest
 
 from benchmarks.measuring.figures import MET, NOT_MEASURED, NOT_MET, Row, Target
 from benchmarks.measuring.hover import late_alone
-from benchmarks.measuring.late import alone_late
 from benchmarks.measuring.latency import Latency
 
 
@@ -40,13 +39,20 @@ def test_every_figure_that_a_target_names_must_meet_it(
     assert row(p50, p99, target).verdict == verdict
 
 
-def test_a_tick_is_alone_late_unless_the_loop_beside_was_late_close_to_it() -> None:
-    beside = [10.0, 20.0, 30.0]
-    assert alone_late([9.91, 10.09, 20.0], beside) == []
-    assert alone_late([9.8, 10.2, 25.0, 31.0], beside) == [9.8, 10.2, 25.0, 31.0]
-    assert alone_late([10.2], beside, within_s=0.3) == []
-    assert alone_late([1.0], []) == [1.0]
-    assert alone_late([], beside) == []
+@pytest.mark.parametrize(
+    ("late_at_s", "beside_at_s", "alone"),
+    [
+        ([9.91, 10.09, 20.0], [10.0, 20.0, 30.0], 0),
+        ([9.8, 10.2, 25.0, 31.0], [10.0, 20.0, 30.0], 4),
+        ([1.0], [], 1),
+        ([], [10.0], 0),
+    ],
+)
+def test_a_tick_is_alone_late_unless_the_loop_beside_was_late_close_to_it(
+    late_at_s: list[float], beside_at_s: list[float], alone: int
+) -> None:
+    late, beside = (np.full(len(times_s), 0.02) for times_s in (late_at_s, beside_at_s))
+    assert late_alone(np.array(late_at_s), late, np.array(beside_at_s), beside) == [0.02] * alone
 
 
 def test_late_by_two_periods_counts_unless_the_loop_beside_was_late_by_one() -> None:
