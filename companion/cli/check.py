@@ -12,11 +12,11 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Self
 
 from rich.console import Console
 from rich.markup import escape
 from rich.padding import Padding
+from rich.status import Status
 from rich.table import Table
 from rich.text import Text
 
@@ -40,6 +40,7 @@ from companion.plugins import CONTROL_LAWS, find
 from companion.preflight import run as preflight
 from companion.preflight.hand_test.command import run_hand_test
 from companion.preflight.hand_test.record import record_path
+from companion.preflight.observe import Progress
 from companion.preflight.px4 import PARAM_ID
 from companion.recorder.client import RecorderProcess
 from companion.runtime.clock import flight_clock
@@ -132,13 +133,23 @@ def _rows(
     """Return the rows of all checks; raises LaunchError if the simulated world cannot be started."""
     config = sitl_config.flight
     with contextlib.ExitStack() as stack:
-        line = stack.enter_context(_Line(people))
+        status = stack.enter_context(people.status("companion check"))
+
+        def line(text: str, _share: float = 0.0) -> None:
+            status.update(f"companion check: {escape(text)}")
+
+        def on_world(message: WorldMessage) -> None:
+            if isinstance(message, WorldProgress):
+                if not people.is_terminal:
+                    print_error(f"companion check: {message.text}")
+                line(message.text)
+
         if arguments.sitl is not None:
             line("starting the simulated world")
             if world is None:
                 world = SitlProcess.start(sitl_config, scratch, px4=arguments.sitl == "px4")
                 stack.callback(world.stop)
-            config = replace_device_settings(config, world.devices(line.world))
+            config = replace_device_settings(config, world.devices(on_world))
         line("recorder")
         known = Observations(
             start_s=0.0,
@@ -148,21 +159,21 @@ def _rows(
             mission_s=None if plan else Plan.build(config.mission, config.vehicle).duration_s,
             recorder=_recorder(config, scratch),
         )
-        return run_until_interrupted(_look(arguments, config, known, line, people))
+        return run_until_interrupted(_look(arguments, config, known, line, status))
 
 
 async def _look(
-    arguments: argparse.Namespace, config: FlightConfig, known: Observations, line: _Line, people: Console
+    arguments: argparse.Namespace, config: FlightConfig, known: Observations, line: Progress, status: Status
 ) -> list[Row]:
     clock, sitl = flight_clock(), arguments.sitl is not None
-    async with open_available(config, clock, lambda device: line(f"opening: {device}")) as devices:
+    async with open_available(config, clock, lambda device: line(f"opening: {device}", 0.0)) as devices:
         rows, _ = await preflight.preflight(
             devices, config, clock, out=Path("flights"), progress=line, known=known, sitl=sitl
         )
         if arguments.hand:
-            line.stop()
+            status.stop()
             record = None if sitl else record_path()
-            rows += await run_hand_test(devices, config, people, arguments.json, record=record)
+            rows += await run_hand_test(devices, config, status.console, arguments.json, record=record)
         return rows
 
 
@@ -175,37 +186,6 @@ def _recorder(config: FlightConfig, scratch: Path) -> str:
     except DeviceError as error:
         return str(error)
     return recorder.finish().error or ""
-
-
-class _Line:
-    """Shows the current check on one line of a terminal; shows nothing elsewhere."""
-
-    def __init__(self, people: Console) -> None:
-        self._status = people.status("companion check") if people.is_terminal else None
-
-    def __enter__(self) -> Self:
-        if self._status is not None:
-            self._status.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
-    def __call__(self, text: str, _share: float = 0.0) -> None:
-        if self._status is not None:
-            self._status.update(f"companion check: {escape(text)}")
-
-    def world(self, message: WorldMessage) -> None:
-        """Show a message of the simulated world during its start."""
-        if isinstance(message, WorldProgress):
-            if self._status is None:
-                print_error(f"companion check: {message.text}")
-            self(message.text)
-
-    def stop(self) -> None:
-        """Remove the line."""
-        if self._status is not None:
-            self._status.stop()
 
 
 def show(console: Console, rows: list[Row], config: SitlConfig, *, simulated: bool) -> None:
