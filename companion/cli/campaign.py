@@ -17,7 +17,7 @@ from rich.console import Console
 
 from companion.campaigns.plan import SAMPLE, plan
 from companion.campaigns.runner import Campaign, run
-from companion.cli.options import add_law, add_world, time_stamp
+from companion.cli.options import add_law, add_overrides, add_world, time_stamp, whole
 from companion.config.document import ConfigError
 from companion.mission.check import check_mission
 from companion.mission.plan import Plan
@@ -27,6 +27,8 @@ from companion.sitl_config.loader import COMMAND_LINE_WORLD, SitlConfig, load_si
 PIPED_WIDTH = 132
 """Width of a table in columns if standard output is not a terminal."""
 CAMPAIGN_WIDTH = 168
+count = whole(1, 10_000)
+"""Parser of a number of flights, seeds or processes, for argparse."""
 MISSION_MAX_S = 300.0
 """Longest mission of a campaign: the fast loop keeps a flight in memory, 1.7 MB for each second, and a slow computer must
 fly it within `companion.campaigns.process.STALL_TIMEOUT_S`."""
@@ -41,14 +43,7 @@ def add_options(parser: argparse.ArgumentParser, *, one_law: bool, world: str | 
     parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
     if one_law:
         add_law(parser)
-    parser.add_argument(
-        "--set",
-        dest="overrides",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="override a setting for every flight",
-    )
+    add_overrides(parser, "override a setting for every flight")
     add_world(parser, world)
     parser.add_argument(
         "--jobs",
@@ -95,13 +90,6 @@ def common(arguments: argparse.Namespace) -> dict[str, Any]:
         "jobs": arguments.jobs,
         "scheduler": arguments.scheduler,
     }
-
-
-def count(text: str) -> int:
-    """Parse a number of flights, seeds or processes, for argparse."""
-    if not text.isdecimal() or not 1 <= int(text) <= 10_000:
-        raise argparse.ArgumentTypeError(f"expected a number from 1 to 10000, got '{text}'")
-    return int(text)
 
 
 def names(text: str) -> tuple[str, ...]:

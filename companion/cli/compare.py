@@ -9,7 +9,7 @@ from typing import Any
 from companion.campaigns.compare.campaign import Compare
 from companion.campaigns.compare.grid import ADAPTATION, Variant, flights_of, variants_of
 from companion.cli.campaign import add_options, add_plan, checked, common, count, fly, names
-from companion.cli.options import MISSION_OR_DEFAULT_HELP
+from companion.cli.options import MISSION_OR_DEFAULT_HELP, whole
 from companion.config.controller import PRESETS
 from companion.config.document import ConfigError
 from companion.config.loader import is_controller_file, preset_of_file
@@ -45,7 +45,9 @@ def add_parser(commands: Any) -> None:
         "--presets", type=names, default=(), metavar="NAME,...", help="default: all presets of each law"
     )
     parser.add_argument("--seeds", type=count, default=5, metavar="N", help="number of seeds per cell (default: 5)")
-    parser.add_argument("--first-seed", type=_first_seed, default=1, metavar="N", help="first seed (default: 1)")
+    parser.add_argument(
+        "--first-seed", type=whole(1, _FIRST_SEED_MAX), default=1, metavar="N", help="first seed (default: 1)"
+    )
     parser.add_argument(
         "--model-error", type=_model_errors, metavar="SHARE,...",
         help="fractions by which masses, inertia and torque constants differ from the vehicle file, 0 to 0.3, e.g. 0,0.1,0.2,0.3 "
@@ -144,9 +146,3 @@ def _campaign(arguments: argparse.Namespace) -> Compare:
         seeds=seeds,
         model_errors=model_errors,
     )
-
-
-def _first_seed(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= _FIRST_SEED_MAX:
-        raise argparse.ArgumentTypeError(f"expected a number from 1 to {_FIRST_SEED_MAX}, got '{text}'")
-    return int(text)

@@ -12,15 +12,24 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from companion.cli.options import MISSION_HELP, MISSION_OR_DEFAULT_HELP, add_law, add_seed, add_world, time_stamp
+from companion.cli.options import (
+    MISSION_HELP,
+    MISSION_OR_DEFAULT_HELP,
+    add_law,
+    add_overrides,
+    add_seed,
+    add_sitl,
+    add_world,
+    time_stamp,
+)
 from companion.cli.schema import schema_json
 from companion.config.document import ConfigError
 from companion.config.ground import FOXGLOVE_DEFAULT, listen_address
 from companion.config.loader import FlightConfig
 from companion.config.shipped import DEFAULT_MISSION
 from companion.mission.check import check_mission
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from companion.runtime.console import print_error, terminal_console
+from companion.model.exit_codes import EXIT_OK
+from companion.runtime.console import terminal_console
 from companion.sitl_config.loader import COMMAND_LINE_WORLD, DEFAULT_WORLD, SitlConfig, load_sitl
 from companion.sitl_config.team import ENDS, load_team
 
@@ -29,9 +38,7 @@ def add_parser(commands: Any) -> None:
     """Add the commands to the sub-parsers of `companion`."""
     fly = commands.add_parser("fly", help="fly a mission", description="Fly a mission, on the vehicle or in SITL.")
     _add_flight_options(fly)
-    fly.add_argument(
-        "--sitl", metavar="stub|px4", help="fly in the simulated world: with the PX4 stub, or with a real PX4 (SITL)"
-    )
+    add_sitl(fly, "fly in the simulated world: with the PX4 stub, or with a real PX4 (SITL)")
     fly.add_argument(
         "--speed",
         metavar="FACTOR|max",
@@ -71,9 +78,7 @@ def add_parser(commands: Any) -> None:
         description="Run every check that a flight runs before it arms. Exit code 0: the vehicle may fly, 3: it may not.",
     )
     _add_flight_options(check, mission_default=True)
-    check.add_argument(
-        "--sitl", metavar="stub|px4", help="check the simulated world's devices, with the PX4 stub or a real PX4"
-    )
+    add_sitl(check, "check the simulated world's devices, with the PX4 stub or a real PX4")
     check.add_argument("--hand", action="store_true", help="also run the guided hand test, which a new set-up requires")
     check.add_argument("--json", action="store_true", help="print only the rows, as JSON")
     check.add_argument("--plan-only", action="store_true", help="check only the mission, without devices")
@@ -109,9 +114,7 @@ def _add_flight_options(parser: argparse.ArgumentParser, mission_default: bool =
         parser.add_argument("mission", help=MISSION_HELP)
     parser.add_argument("--vehicle", metavar="FILE", help="vehicle file instead of the mission's")
     add_law(parser)
-    parser.add_argument(
-        "--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help="e.g. world.payload_kg=0.3"
-    )
+    add_overrides(parser, "e.g. world.payload_kg=0.3")
     add_world(parser)
     add_seed(parser)
 
@@ -151,9 +154,6 @@ def _load(arguments: argparse.Namespace, *, hardware: bool, real_px4: bool = Fal
 def _check(arguments: argparse.Namespace) -> int:
     from companion.cli import check as check_command  # imports MAVSDK
 
-    if arguments.sitl not in (None, "stub", "px4"):
-        print_error(f"companion check: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
-        return EXIT_BAD_INPUT
     hardware = arguments.sitl is None and not arguments.plan_only
     return check_command.run(arguments, _load(arguments, hardware=hardware, real_px4=arguments.sitl == "px4"))
 
@@ -162,12 +162,7 @@ def _fly(arguments: argparse.Namespace) -> int:
     from companion.cli.campaign import reserved_folder
     from companion.launcher.run import run_flight
 
-    if arguments.sitl not in (None, "stub", "px4"):
-        print_error(f"companion fly: --sitl={arguments.sitl}: expected --sitl, --sitl=stub or --sitl=px4")
-        return EXIT_BAD_INPUT
     speed = speed_of(arguments)
-    if speed is not None and not speed > 0.0:
-        return EXIT_BAD_INPUT
     if arguments.mqtt is not None:
         off, url = arguments.mqtt == "off", json.dumps(arguments.mqtt)
         arguments.overrides += ["vehicle.ground.mqtt=null" if off else f"vehicle.ground.mqtt.url={url}"]
@@ -183,9 +178,7 @@ def _fly(arguments: argparse.Namespace) -> int:
         *no_bus_time(config, speed),
     ]
     if problems:
-        for line in problems:
-            print_error(line)
-        return EXIT_BAD_INPUT
+        raise ConfigError(problems)
     default = Path("flights") / f"{time_stamp()}-{config.mission.name}"
     with reserved_folder("fly", arguments.out, default, "flight.mcap") as out:
         return run_flight(
@@ -194,28 +187,26 @@ def _fly(arguments: argparse.Namespace) -> int:
 
 
 def speed_of(arguments: argparse.Namespace) -> float | None:
-    """Return the speed of a flight in simulated time, or None for one in real time; 0 if the options are invalid, after a line."""
-    given = arguments.speed
-    problem = None
+    """Return the speed of a flight in simulated time, or None for one in real time; raises ConfigError if the options are invalid."""
+    given, command = arguments.speed, f"companion {arguments.command}"
     if (given is not None or arguments.real_time) and arguments.sitl is None:
         option = "--speed" if given is not None else "--real-time"
-        problem = (
-            f"{option}: expected only with --sitl, because a vehicle flies in real time; add --sitl or leave it out"
+        raise ConfigError(
+            f"{command}: {option}: expected only with --sitl, because a vehicle flies in real time; add --sitl or leave it out"
         )
-    elif given is not None and arguments.real_time:
-        problem = f"--speed {given}: expected not together with --real-time, which flies on the computer's clock; leave one out"
-    if problem is None and (given is None or given == "max"):
-        return None if arguments.real_time or arguments.sitl is None else math.inf if given else 1.0
-    if problem is None:
-        try:
-            speed = float(given)
-        except ValueError:
-            speed = math.nan
-        if 0.0 < speed < math.inf:
-            return speed
-        problem = f"--speed {given}: expected a number above 0, such as 0.25, or max"
-    print_error(f"companion {arguments.command}: {problem}")
-    return 0.0
+    if given is not None and arguments.real_time:
+        raise ConfigError(
+            f"{command}: --speed {given}: expected not together with --real-time, which flies on the computer's clock; leave one out"
+        )
+    if given is None:
+        return None if arguments.real_time or arguments.sitl is None else 1.0
+    try:
+        speed = math.inf if given == "max" else float(given)
+    except ValueError:
+        speed = math.nan
+    if not speed > 0.0 or (math.isinf(speed) and given != "max"):
+        raise ConfigError(f"{command}: --speed {given}: expected a number above 0, such as 0.25, or max")
+    return speed
 
 
 def no_bus_time(config: SitlConfig, speed: float | None) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import datetime
+from collections.abc import Callable
 
 from companion.config.controller import PRESETS
 from companion.config.shipped import DEFAULT_MISSION, names
@@ -48,6 +49,33 @@ def add_world(parser: argparse.ArgumentParser, default: str | None = COMMAND_LIN
     )
 
 
+def add_overrides(parser: argparse.ArgumentParser, help: str) -> None:
+    """Add `--set`."""
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE", help=help)
+
+
+def add_sitl(parser: argparse.ArgumentParser, help: str) -> None:
+    """Add `--sitl`."""
+    parser.add_argument("--sitl", type=_autopilot, metavar="stub|px4", help=help)
+
+
+def _autopilot(text: str) -> str:
+    if text not in ("stub", "px4"):
+        raise argparse.ArgumentTypeError(f"expected --sitl, --sitl=stub or --sitl=px4, got '{text}'")
+    return text
+
+
+def whole(low: int, high: int) -> Callable[[str], int]:
+    """Return an argparse type: a whole number within limits."""
+
+    def parse(text: str) -> int:
+        if not text.isdecimal() or len(text) > len(str(high)) or not low <= int(text) <= high:
+            raise argparse.ArgumentTypeError(f"expected a whole number from {low} to {high}, got '{text}'")
+        return int(text)
+
+    return parse
+
+
 def add_seed(parser: argparse.ArgumentParser) -> None:
     """Add `--seed`, a shorthand for `--set world.seed=N`."""
     parser.add_argument(
@@ -62,6 +90,4 @@ def add_seed(parser: argparse.ArgumentParser) -> None:
 
 
 def _seed_override(text: str) -> str:
-    if not text.isdecimal() or len(text) > 9:
-        raise argparse.ArgumentTypeError(f"expected a whole number from 0 to 999999999, got '{text}'")
-    return f"world.seed={text}"
+    return f"world.seed={whole(0, 999_999_999)(text)}"

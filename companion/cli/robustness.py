@@ -10,7 +10,7 @@ from companion.campaigns.pair import PairRobustness
 from companion.campaigns.robustness.campaign import Robustness
 from companion.campaigns.robustness.cases import Case, Cases, read_cases
 from companion.cli.campaign import add_options, add_plan, checked, common, count, fly, refuse_beside, why_unusable
-from companion.cli.options import MISSION_OR_DEFAULT_HELP
+from companion.cli.options import MISSION_OR_DEFAULT_HELP, whole
 from companion.config.document import ConfigError
 from companion.config.shipped import DEFAULT_MISSION, names
 from companion.mission.check import check_mission
@@ -28,7 +28,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("mission", nargs="?", help=MISSION_OR_DEFAULT_HELP)
     parser.add_argument("--draws", type=count, default=500, metavar="N", help="number of flights (default: 500)")
     parser.add_argument("--seed", type=count, default=1, metavar="N", help="seed of the draws (default: 1)")
-    parser.add_argument("--first", type=_number, default=0, metavar="N", help="number of the first draw (default: 0)")
+    parser.add_argument(
+        "--first", type=whole(0, 999_999_999), default=0, metavar="N", help="number of the first draw (default: 0)"
+    )
     parser.add_argument(
         "--model-error",
         dest="overrides",
@@ -47,12 +49,6 @@ def add_parser(commands: Any) -> None:
     add_options(parser, one_law=True, world=None)
     add_plan(parser)
     parser.set_defaults(run=run)
-
-
-def _number(text: str) -> int:
-    if not text.isdecimal() or len(text) > 9:
-        raise argparse.ArgumentTypeError(f"expected a whole number, 0 or greater, got '{text}'")
-    return int(text)
 
 
 def _model_error_override(text: str) -> str:

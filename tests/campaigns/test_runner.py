@@ -284,7 +284,7 @@ CASES = "mission: a.yaml\ncontroller: adaptive\npreset: paper\ncases: []\n"
         (("faults", "--kinds", "gust,tool_broken"), r"tool_broken need a mission with a contact, got other kinds"),
         (("robustness", "--case", "heavy"), r"--case needs --cases FILE"),
         (("robustness", "--cases", "empty.yaml"), r"empty\.yaml: cases: expected at least one case"),
-        (("compare", "--first-seed", "1000000"), r"expected a number from 1 to 900000"),
+        (("compare", "--first-seed", "1000000"), r"expected a whole number from 1 to 900000"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_and_nothing_flies(tmp_path: Path, words: tuple[str, ...], why: str) -> None:

@@ -306,7 +306,7 @@ def test_a_plan_counts_flights_and_writes_nothing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (("--budget", "0"), "expected a number from 1"),
+        (("--budget", "0"), "expected a whole number from 1"),
         (("--controller", "nofile.yaml"), "nofile.yaml: no such file"),
         (
             ("--controller", str(ROOT / "configs/controllers/csc_tuned.yaml"), "--preset", "paper"),

@@ -93,7 +93,7 @@ COMMAND_LINES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (r"^mission cath: expected carry, catch, circuit, .* or a file, found neither \(did you mean catch\?\)$",),
     ),
     "copies over existing files": (("init", "."), (r"^companion init: \. exists; .*nothing was written$",)),
-    "unknown world": (("fly", "mission.yaml", "--sitl=moon"), (r"^companion fly: --sitl=moon: expected",)),
+    "unknown world": (("fly", "mission.yaml", "--sitl=moon"), (r"^companion fly: argument --sitl: expected --sitl",)),
     "bad preset": ((*FLY, "--preset", "papr"), (r"--preset papr: .*paper, .*recommended",)),
     "negative seed": ((*FLY, "--seed=-1"), (r"^companion fly: argument --seed: expected a whole number from 0",)),
     "model error that is too large": (

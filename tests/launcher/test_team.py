@@ -59,7 +59,7 @@ FLY = ("team", "fly", TEAM, "--sitl", "--world", "ideal", "--speed", "max", "--o
         (("team", "fly", TEAM, "--sitl", "px4", "--out", "out"), "unknown arguments: px4"),
         (
             ("team", "fly", TEAM, "--sitl=px5", "--out", "out"),
-            "companion team: --sitl=px5: expected --sitl, --sitl=stub or --sitl=px4",
+            "companion team fly: argument --sitl: expected --sitl, --sitl=stub or --sitl=px4, got 'px5'",
         ),
         (
             ("team", "fly", "carrry", "--sitl", "--out", "out"),
