@@ -17,13 +17,10 @@ from sitl.pty import PtyLine
 from sitl.servo.model import ServoModel, ServoRefusal
 from sitl.servo.protocol import (
     BROADCAST_ID,
-    MAX_ID,
-    MAX_LENGTH,
     Instruction,
     Packet,
     PacketParser,
     StatusError,
-    fast_status,
     status,
 )
 from sitl.servo.registers import BAUDS
@@ -69,19 +66,13 @@ class ServoLine:
             return b""
         for servo in self._listening:
             servo.drive.heard_instruction()
-        handler = {
-            Instruction.SYNC_READ: self._sync_read,
-            Instruction.SYNC_WRITE: self._sync_write,
-            Instruction.FAST_SYNC_READ: self._fast_sync_read,
-            Instruction.BULK_READ: self._bulk_read,
-            Instruction.FAST_BULK_READ: self._fast_bulk_read,
-        }.get(packet.instruction)  # type: ignore[call-overload]
-        if packet.packet_id == BROADCAST_ID:
-            if handler is not None:
-                answer: bytes = handler(packet.parameters)
-                return answer
-            return self._broadcast(packet)
-        return self._unicast(packet)
+        if packet.packet_id != BROADCAST_ID:
+            return self._unicast(packet)
+        if packet.instruction == Instruction.SYNC_READ:
+            return self._sync_read(packet.parameters)
+        if packet.instruction == Instruction.SYNC_WRITE:
+            return self._sync_write(packet.parameters)
+        return self._broadcast(packet)
 
     # --- one servo or all --------------------------------------------------------------------------------------------
 
@@ -137,42 +128,15 @@ class ServoLine:
     # --- several servos ----------------------------------------------------------------------------------------------
 
     def _sync_read(self, parameters: bytes) -> bytes:
-        return self._read_chain(_sync_read_items(parameters))
-
-    def _bulk_read(self, parameters: bytes) -> bytes:
-        return self._read_chain(_bulk_read_items(parameters))
-
-    def _fast_sync_read(self, parameters: bytes) -> bytes:
-        return self._fast_read(_sync_read_items(parameters))
-
-    def _fast_bulk_read(self, parameters: bytes) -> bytes:
-        return self._fast_read(_bulk_read_items(parameters))
-
-    def _read_chain(self, items: list[tuple[int, int, int]]) -> bytes:
-        out = bytearray()
-        for servo_id, address, length in items:
+        if len(parameters) < 5:
+            return b""
+        address, length, out = _word(parameters, 0), _word(parameters, 2), bytearray()
+        for servo_id in parameters[4:]:
             having = self._having(servo_id)
             if not having or having[0].status_return_level == 0:
                 break  # each servo waits for the status packet of the previous one
             out += _together([self._status(servo, *_try_read(servo, address, length)) for servo in having])
         return bytes(out)
-
-    def _fast_read(self, items: list[tuple[int, int, int]]) -> bytes:
-        blocks: list[tuple[int, int, bytes]] = []
-        size = sum(length + 4 for _, _, length in items)
-        if size > MAX_LENGTH:
-            return b""
-        for servo_id, address, length in items:
-            having = self._having(servo_id)
-            if len(having) != 1 or having[0].status_return_level == 0:
-                break
-            servo = having[0]
-            error, data = _try_read(servo, address, length)
-            self._delay_s += servo.return_delay_s
-            blocks.append((servo_id, error | servo.alert, data or bytes(length)))
-        if not blocks:
-            return b""
-        return fast_status(blocks, size)
 
     def _sync_write(self, parameters: bytes) -> bytes:
         if len(parameters) >= 4:
@@ -205,20 +169,6 @@ def _together(answers: list[bytes]) -> bytes:
 
 def _word(data: bytes, offset: int) -> int:
     return data[offset] | data[offset + 1] << 8
-
-
-def _sync_read_items(parameters: bytes) -> list[tuple[int, int, int]]:
-    """Return (id, address, length) of each servo; empty if the request is malformed."""
-    if len(parameters) < 5:
-        return []
-    address, length = _word(parameters, 0), _word(parameters, 2)
-    return [(servo_id, address, length) for servo_id in parameters[4:] if servo_id <= MAX_ID]
-
-
-def _bulk_read_items(parameters: bytes) -> list[tuple[int, int, int]]:
-    if len(parameters) % 5:
-        return []
-    return [(parameters[i], _word(parameters, i + 1), _word(parameters, i + 3)) for i in range(0, len(parameters), 5)]
 
 
 def _try_read(servo: ServoModel, address: int, length: int) -> tuple[StatusError, bytes]:

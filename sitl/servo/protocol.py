@@ -28,9 +28,6 @@ class Instruction(IntEnum):
     STATUS = 0x55
     SYNC_READ = 0x82
     SYNC_WRITE = 0x83
-    FAST_SYNC_READ = 0x8A
-    BULK_READ = 0x92
-    FAST_BULK_READ = 0x9A
 
 
 class StatusError(IntEnum):
@@ -70,26 +67,6 @@ def packet(packet_id: int, body: bytes) -> bytes:
 def status(servo_id: int, error: int, data: bytes = b"") -> bytes:
     """Return a status packet; `error` is the whole error byte, alert bit included."""
     return packet(servo_id, bytes((Instruction.STATUS, error)) + data)
-
-
-def fast_status(blocks: list[tuple[int, int, bytes]], total_blocks_size: int) -> bytes:
-    """Return the single status packet of a fast sync or bulk read.
-
-    Args:
-        blocks: (servo id, error byte, data) of the servos that answered, in the order of the request.
-        total_blocks_size: data bytes of all requested servos plus 4 per servo; the first servo announces this size even if others
-            do not answer.
-
-    The packet is not stuffed, and each block ends with the CRC of everything before it.
-    """
-    out = bytearray(HEADER)
-    out.append(BROADCAST_ID)
-    out += (1 + total_blocks_size).to_bytes(2, "little")
-    out.append(Instruction.STATUS)
-    for servo_id, error, data in blocks:
-        out += bytes((error, servo_id)) + data
-        out += crc16(out).to_bytes(2, "little")
-    return bytes(out)
 
 
 @dataclass(frozen=True, slots=True)

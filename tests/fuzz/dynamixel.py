@@ -17,7 +17,7 @@ from companion.io.dynamixel.bus import ArmBus
 from companion.io.dynamixel.port import NOISE_BYTES, ServoPort
 from sitl.servo.bus import ServoLine
 from sitl.servo.model import ServoModel
-from sitl.servo.protocol import ALERT, Instruction, fast_status, packet, status
+from sitl.servo.protocol import ALERT, Instruction, packet, status
 from tests.fuzz.mutate import mutated
 from tests.fuzz.target import Endless, Target, Wrong, one_line
 from tests.io.arm_rig import JOINTS, arm_config
@@ -265,7 +265,6 @@ def _corpus() -> list[bytes]:
         status(IDS[0], 0, bytes((6, 4, 45))),
         status(IDS[0], 0),
         status(IDS[0], 0, b"\xff\xff\xfd" * 300),
-        fast_status([(servo_id, 0, _block(5, _WATCHDOG)) for servo_id in IDS], 2 * (dxl.BLOCK_SIZE + 4)),
         packet(IDS[0], bytes((Instruction.READ, 132, 0, 4, 0))),
         b"\xff\xff\xfd\x00",
         b"\xff\xff\xfd\x00\x0b\x00\x04\x55\x00" * 3,

@@ -9,7 +9,6 @@ from typing import Any
 from dynamixel_sdk import (
     COMM_RX_TIMEOUT,
     COMM_SUCCESS,
-    GroupBulkRead,
     GroupSyncRead,
     GroupSyncWrite,
     PacketHandler,
@@ -66,21 +65,14 @@ def test_ping_and_broadcast_ping_find_both_servos() -> None:
     on_bus(talk, servos(100, 200))
 
 
-def test_sync_bulk_and_fast_reads_agree() -> None:
+def test_a_sync_read_returns_the_values_of_all_servos() -> None:
     def talk(port: Any, protocol: Any) -> None:
         sync = GroupSyncRead(port, protocol, 126, 10)
-        bulk = GroupBulkRead(port, protocol)
         for i in IDS:
             assert sync.addParam(i)
-        assert bulk.addParam(11, 132, 4)
-        assert bulk.addParam(12, 146, 1)
-        for read in (sync.txRxPacket, sync.fastSyncRead):
-            assert read() == COMM_SUCCESS
-            assert [sync.getData(i, 132, 4) for i in IDS] == [0x0AFD, 2079]
-            assert [sync.getData(i, 128, 4) for i in IDS] == [0xFFFFFFFF, 0], "-1, unsigned as the SDK has it"
-        for read in (bulk.txRxPacket, bulk.fastBulkRead):
-            assert read() == COMM_SUCCESS
-            assert (bulk.getData(11, 132, 4), bulk.getData(12, 146, 1)) == (0x0AFD, 30)
+        assert sync.txRxPacket() == COMM_SUCCESS
+        assert [sync.getData(i, 132, 4) for i in IDS] == [0x0AFD, 2079]
+        assert [sync.getData(i, 128, 4) for i in IDS] == [0xFFFFFFFF, 0], "-1, unsigned as the SDK has it"
 
     pair = servos(0x0AFD, 2079)
     pair[0].update(0.0, 0x0AFD * RAD_PER_COUNT, -0.024)  # velocity FFFFFFFF before position FD0A: has to be stuffed
