@@ -10,7 +10,6 @@ import math
 from collections import deque
 from typing import Final
 
-from companion.model.frames import quat_multiply
 from companion.model.rotors import motor_signal
 from companion.model.types import Quat, Vec3
 from sitl.autopilot.cascade import Cascade
@@ -22,7 +21,7 @@ from sitl.autopilot.navigator import Navigator
 from sitl.autopilot.origin import Origin
 from sitl.autopilot.params import Params
 from sitl.autopilot.position_control import heading_rad
-from sitl.autopilot.setpoints import OffboardTarget, PositionTarget, RateTarget
+from sitl.autopilot.setpoints import OffboardTarget, PositionTarget
 from sitl.autopilot.types import (
     AttitudeTarget,
     Battery,
@@ -289,11 +288,6 @@ class Px4Stub:
             self.navigator.settle(self.land.landed)
             self.target = offboard
             return
-        if isinstance(offboard, RateTarget):
-            self.position_controlled = False
-            self.navigator.settle(self.land.landed)
-            self.target = self._attitude_for_rates(estimate, offboard)
-            return
         self.position_controlled = True
         since_s = t_s - self._position_at_s
         if since_s < _POSITION_PERIOD_S - _TIME_EPSILON_S:
@@ -309,16 +303,6 @@ class Px4Stub:
             landed=self.land.landed,
             touching=self.land.ground_contact or self.land.maybe_landed,
         )
-
-    def _attitude_for_rates(self, estimate: Estimate, rates: RateTarget) -> AttitudeTarget:
-        """Return the attitude setpoint for which the attitude P loop commands these rates, because the cascade takes only attitudes."""
-        gains = (self.params.real("MC_ROLL_P"), self.params.real("MC_PITCH_P"), self.params.real("MC_YAW_P"))
-        x, y, z = (rate / (2.0 * gain) for rate, gain in zip(rates.rates_frd_rad_s, gains, strict=True))
-        size = math.sqrt(x * x + y * y + z * z)
-        if size > 0.7:
-            x, y, z = x * 0.7 / size, y * 0.7 / size, z * 0.7 / size
-        turn = (math.sqrt(1.0 - (x * x + y * y + z * z)), x, y, z)
-        return AttitudeTarget(quat_multiply(estimate.attitude_ned_frd, turn), rates.thrust)
 
     def _on_arming(self) -> None:
         self._cascade.reset()

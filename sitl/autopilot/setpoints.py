@@ -14,15 +14,6 @@ NOTHING: Axis3 = (None, None, None)
 
 
 @dataclass(frozen=True, slots=True)
-class RateTarget:
-    """Body rate setpoint."""
-
-    rates_frd_rad_s: Vec3
-    thrust: float
-    """Collective thrust, 0 to 1."""
-
-
-@dataclass(frozen=True, slots=True)
 class PositionTarget:
     """Position setpoint (trajectory_setpoint); None means that the quantity is not commanded on that axis."""
 
@@ -48,35 +39,27 @@ class PositionTarget:
         return all(value is None for value in axes)
 
 
-OffboardTarget = AttitudeTarget | RateTarget | PositionTarget
+OffboardTarget = AttitudeTarget | PositionTarget
 
-_ROLL_RATE_IGNORE, _PITCH_RATE_IGNORE, _YAW_RATE_IGNORE = 1, 2, 4
-_THROTTLE_IGNORE, _ATTITUDE_IGNORE = 64, 128
+_YAW_RATE_IGNORE, _THROTTLE_IGNORE, _ATTITUDE_IGNORE = 4, 64, 128
 
 
-def decode_attitude_target(
-    type_mask: int, q_wxyz: Quat, rates_frd_rad_s: Vec3, thrust: float
-) -> AttitudeTarget | RateTarget | None:
+def decode_attitude_target(type_mask: int, q_wxyz: Quat, rates_frd_rad_s: Vec3, thrust: float) -> AttitudeTarget | None:
     """Decode SET_ATTITUDE_TARGET as PX4 does, with thrust limited to 0 to 1.
 
     Returns:
-        The setpoint, or None if PX4 ignores the message: its thrust is non-finite or masked out, its quaternion is zero or
-        non-finite, or, without an attitude, a body rate is non-finite or the roll or pitch rate is masked out.
+        The setpoint, or None if PX4 ignores the message: its thrust is non-finite or masked out, or its quaternion is zero or
+        non-finite. A setpoint of body rates, without an attitude, is ignored, too.
     """
-    if type_mask & _THROTTLE_IGNORE or not math.isfinite(thrust):
+    if type_mask & (_THROTTLE_IGNORE | _ATTITUDE_IGNORE) or not math.isfinite(thrust):
         return None
     thrust = min(1.0, max(0.0, thrust))
-    if not type_mask & _ATTITUDE_IGNORE:
-        norm = math.sqrt(sum(value * value for value in q_wxyz))
-        if not norm > 1e-6 or not math.isfinite(norm):
-            return None
-        yaw_rate = 0.0 if type_mask & _YAW_RATE_IGNORE or not math.isfinite(rates_frd_rad_s[2]) else rates_frd_rad_s[2]
-        w, x, y, z = q_wxyz
-        return AttitudeTarget((w / norm, x / norm, y / norm, z / norm), thrust, yaw_rate)
-    if type_mask & (_ROLL_RATE_IGNORE | _PITCH_RATE_IGNORE) or not all(math.isfinite(rate) for rate in rates_frd_rad_s):
+    norm = math.sqrt(sum(value * value for value in q_wxyz))
+    if not norm > 1e-6 or not math.isfinite(norm):
         return None
-    roll, pitch, yaw = rates_frd_rad_s
-    return RateTarget((roll, pitch, 0.0 if type_mask & _YAW_RATE_IGNORE else yaw), thrust)
+    yaw_rate = 0.0 if type_mask & _YAW_RATE_IGNORE or not math.isfinite(rates_frd_rad_s[2]) else rates_frd_rad_s[2]
+    w, x, y, z = q_wxyz
+    return AttitudeTarget((w / norm, x / norm, y / norm, z / norm), thrust, yaw_rate)
 
 
 MAV_FRAME_LOCAL_NED = 1

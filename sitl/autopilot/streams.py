@@ -28,59 +28,29 @@ class Stream:
 
 # Defaults: mavlink_main.cpp, MAVLINK_MODE_ONBOARD and MAVLINK_MODE_NORMAL of 1.16. Ceilings: measured, or the rate of the topic.
 STREAMS: dict[int, Stream] = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: Stream(build=telemetry.heartbeat, onboard_hz=1.0, ground_hz=1.0, ceiling_hz=1.0),
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: Stream(
-        build=telemetry.attitude_quaternion, onboard_hz=50.0, ground_hz=10.0, ceiling_hz=212.0
-    ),
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: Stream(
-        build=telemetry.highres_imu, onboard_hz=50.0, ground_hz=0.0, ceiling_hz=241.0
-    ),
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: Stream(
-        build=telemetry.local_position_ned, onboard_hz=30.0, ground_hz=1.0, ceiling_hz=124.0
-    ),
-    mavlink.MAVLINK_MSG_ID_ODOMETRY: Stream(build=telemetry.odometry, onboard_hz=30.0, ground_hz=0.0, ceiling_hz=124.0),
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: Stream(
-        build=telemetry.attitude, onboard_hz=100.0, ground_hz=15.0, ceiling_hz=212.0
-    ),
-    mavlink.MAVLINK_MSG_ID_TIMESYNC: Stream(
-        build=telemetry.timesync_request, onboard_hz=10.0, ground_hz=0.0, ceiling_hz=10.0
-    ),
-    mavlink.MAVLINK_MSG_ID_ALTITUDE: Stream(build=telemetry.altitude, onboard_hz=10.0, ground_hz=1.0),
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_TARGET: Stream(
-        build=telemetry.attitude_target, onboard_hz=10.0, ground_hz=2.0, ceiling_hz=124.0
-    ),
-    mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: Stream(
-        build=telemetry.position_target_local_ned, onboard_hz=10.0, ground_hz=1.5
-    ),
-    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: Stream(
-        build=telemetry.battery_status, onboard_hz=0.5, ground_hz=0.5, ceiling_hz=10.0
-    ),
-    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: Stream(build=telemetry.estimator_status, onboard_hz=1.0, ground_hz=0.5),
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Stream(
-        build=telemetry.extended_sys_state, onboard_hz=5.0, ground_hz=1.0
-    ),
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: Stream(
-        build=telemetry.global_position_int, onboard_hz=50.0, ground_hz=5.0, ceiling_hz=124.0
-    ),
-    mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: Stream(build=telemetry.gps_global_origin, onboard_hz=1.0, ground_hz=1.0),
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION: Stream(build=telemetry.home_position, onboard_hz=0.5, ground_hz=0.5),
-    mavlink.MAVLINK_MSG_ID_PING: Stream(build=telemetry.ping, onboard_hz=1.0, ground_hz=0.1, ceiling_hz=1.0),
-    mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: Stream(
-        build=telemetry.servo_output_raw, onboard_hz=10.0, ground_hz=1.0, ceiling_hz=212.0
-    ),
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: Stream(build=telemetry.sys_status, onboard_hz=5.0, ground_hz=1.0),
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: Stream(build=telemetry.system_time, onboard_hz=1.0, ground_hz=0.0),
-    mavlink.MAVLINK_MSG_ID_VFR_HUD: Stream(build=telemetry.vfr_hud, onboard_hz=10.0, ground_hz=4.0),
-    mavlink.MAVLINK_MSG_ID_VIBRATION: Stream(build=telemetry.vibration, onboard_hz=0.5, ground_hz=0.1),
-    mavlink.MAVLINK_MSG_ID_ACTUATOR_OUTPUT_STATUS: Stream(
-        build=telemetry.actuator_output_status, onboard_hz=0.0, ground_hz=0.0, ceiling_hz=212.0
-    ),
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: Stream(
-        build=telemetry.scaled_imu, onboard_hz=0.0, ground_hz=0.0, ceiling_hz=124.0
-    ),
-    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: Stream(
-        build=telemetry.autopilot_version, onboard_hz=0.0, ground_hz=0.0, ceiling_hz=1.0
-    ),
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: Stream(telemetry.heartbeat, 1.0, 1.0, 1.0),
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: Stream(telemetry.attitude_quaternion, 50.0, 10.0, 212.0),
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: Stream(telemetry.highres_imu, 50.0, 0.0, 241.0),
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: Stream(telemetry.local_position_ned, 30.0, 1.0, 124.0),
+    mavlink.MAVLINK_MSG_ID_ODOMETRY: Stream(telemetry.odometry, 30.0, 0.0, 124.0),
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: Stream(telemetry.attitude, 100.0, 15.0, 212.0),
+    mavlink.MAVLINK_MSG_ID_TIMESYNC: Stream(telemetry.timesync_request, 10.0, 0.0, 10.0),
+    mavlink.MAVLINK_MSG_ID_ALTITUDE: Stream(telemetry.altitude, 10.0, 1.0),
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_TARGET: Stream(telemetry.attitude_target, 10.0, 2.0, 124.0),
+    mavlink.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: Stream(telemetry.position_target_local_ned, 10.0, 1.5),
+    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: Stream(telemetry.battery_status, 0.5, 0.5, 10.0),
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: Stream(telemetry.estimator_status, 1.0, 0.5),
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Stream(telemetry.extended_sys_state, 5.0, 1.0),
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: Stream(telemetry.global_position_int, 50.0, 5.0, 124.0),
+    mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: Stream(telemetry.gps_global_origin, 1.0, 1.0),
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: Stream(telemetry.home_position, 0.5, 0.5),
+    mavlink.MAVLINK_MSG_ID_PING: Stream(telemetry.ping, 1.0, 0.1, 1.0),
+    mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: Stream(telemetry.servo_output_raw, 10.0, 1.0, 212.0),
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: Stream(telemetry.sys_status, 5.0, 1.0),
+    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: Stream(telemetry.system_time, 1.0, 0.0),
+    mavlink.MAVLINK_MSG_ID_VFR_HUD: Stream(telemetry.vfr_hud, 10.0, 4.0),
+    mavlink.MAVLINK_MSG_ID_VIBRATION: Stream(telemetry.vibration, 0.5, 0.1),
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: Stream(telemetry.autopilot_version, 0.0, 0.0, 1.0),
 }
 
 

@@ -10,7 +10,6 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.model.constants import STANDARD_GRAVITY_M_S2
 from companion.model.frames import euler_zyx_from_quat
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.modes import NavState
@@ -154,28 +153,8 @@ def highres_imu(stub: Px4Stub) -> Message | None:
     if imu is None:
         return None
     return mavlink.MAVLink_highres_imu_message(
-        clock_us(stub),
-        *imu.accel_frd_m_s2,
-        *imu.gyro_frd_rad_s,
-        0.0,
-        0.0,
-        0.0,
-        _PRESSURE_HPA,
-        0.0,
-        0.0,
-        _TEMPERATURE_C,
-        0x3F,
-    )
-
-
-def scaled_imu(stub: Px4Stub) -> Message | None:
-    """Return SCALED_IMU with specific force in mG and body rates in mrad/s."""
-    imu = stub.imu
-    if imu is None:
-        return None
-    accel = (_i16(value / STANDARD_GRAVITY_M_S2 * 1e3) for value in imu.accel_frd_m_s2)
-    gyro = (_i16(value * 1e3) for value in imu.gyro_frd_rad_s)
-    return mavlink.MAVLink_scaled_imu_message(_ms(stub), *accel, *gyro, 0, 0, 0, int(_TEMPERATURE_C * 100))
+        clock_us(stub), *imu.accel_frd_m_s2, *imu.gyro_frd_rad_s, 0.0, 0.0, 0.0, _PRESSURE_HPA, 0.0, 0.0, _TEMPERATURE_C, 0x3F
+    )  # fmt: skip
 
 
 def estimator_status(stub: Px4Stub) -> Message | None:
@@ -299,14 +278,6 @@ def servo_output_raw(stub: Px4Stub) -> Message:
     turns = stub.armed and not stub.kill_switch
     pulses = [round(1000 + 1000 * command) if turns else 900 for command in stub.rotors]
     return mavlink.MAVLink_servo_output_raw_message(clock_us(stub) & 0xFFFFFFFF, 0, *[*pulses, *[0] * 8][:8])
-
-
-def actuator_output_status(stub: Px4Stub) -> Message:
-    """Return ACTUATOR_OUTPUT_STATUS with the rotor commands, 0 to 1."""
-    count = len(stub.rotors)
-    return mavlink.MAVLink_actuator_output_status_message(
-        clock_us(stub), (1 << count) - 1, [*stub.rotors, *[0.0] * (32 - count)]
-    )
 
 
 def system_time(stub: Px4Stub) -> Message:

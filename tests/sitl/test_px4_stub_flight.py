@@ -12,7 +12,7 @@ from sitl.autopilot.land_detector import LandDetector
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.origin import Origin
 from sitl.autopilot.params import Params
-from sitl.autopilot.setpoints import PositionTarget, RateTarget
+from sitl.autopilot.setpoints import PositionTarget
 from sitl.autopilot.types import AttitudeTarget
 from tests.sitl.px4_rig import Rig
 
@@ -54,7 +54,7 @@ def run_until(rig: Rig, condition: object, limit_s: float) -> float:
     return rig.t_s - start_s
 
 
-def stream(rig: Rig, duration_s: float, target: AttitudeTarget | RateTarget | PositionTarget) -> None:
+def stream(rig: Rig, duration_s: float, target: AttitudeTarget | PositionTarget) -> None:
     """A setpoint every 20 ms of world time."""
     until_s = rig.t_s + duration_s
     due_s = rig.t_s
