@@ -50,7 +50,7 @@ class Mocap:
         self, config: WorldConfig, ball: TrackedBall | None, scene: Scene, machine: Machine, *, between_steps: bool
     ) -> None:
         self._config, self._scene, self._machine, self._between_steps = config, scene, machine, between_steps
-        self._errors = MocapErrors.of(config.mocap, config.seed)
+        self._errors = MocapErrors(config.mocap, config.seed) if config.mocap.on else None
         self._misalignment = MocapMisalignment.of(config)
         self._ball_is_body = ball is not None and ball.kind == "body"
         self._markers = None if ball is None else BallMarkers(config, scene)

@@ -151,8 +151,9 @@ class Plant:
         if transmissions:
             self.machine.add_joint_inertia(transmissions)
         hover_n = self.machine.weight_n / self.machine.rotor_count
-        self._imu_errors = ImuErrors.of(config.imu, IMU_EVERY * PHYSICS_DT_S, hover_n, vehicle.airframe.rotor_layout)
-        rest_m, arm_m = vehicle.airframe.ground_clearance_m, vehicle.airframe.rotor_layout.arm_m
+        layout, interval_s = vehicle.airframe.rotor_layout, IMU_EVERY * PHYSICS_DT_S
+        self._imu_errors = ImuErrors(config.imu, interval_s, hover_n, layout) if config.imu.on else None
+        rest_m, arm_m = vehicle.airframe.ground_clearance_m, layout.arm_m
         self._barometer = Barometer(config.barometer, self.machine.weight_n, rest_m, arm_m, config.seed)
         ball = vehicle.devices.mocap.ball
         self.mocap = Mocap(config, ball, self.scene, self.machine, between_steps=between_steps)
@@ -161,7 +162,7 @@ class Plant:
         self._weight = HungWeight(config) if config.net_weight_kg > 0.0 else None
         self.force_is_read = True
         """Whether the force sensor is being read; always true in the fast closed loop."""
-        self._force_sensor = ForceSensor.of(config.force_sensor, config.seed)
+        self._force_sensor = ForceSensor(config.force_sensor, config.seed) if config.force_sensor.on else None
         self._rotors: RotorCommands = (0.0,) * self.machine.rotor_count
         self._tick = 0
         self._imu_sample: ImuSample | None = None

@@ -79,13 +79,14 @@ class Machine:
         self._rotor_max_n, self._rotor_height_m = airframe.thrust_max_n / layout.count, layout.height_m
         self._rotors_at_m = tuple((x, y) for x, y, _ in layout.positions_body_m)
         self._disk_m, self._reach_m = airframe.disk_radius_m, airframe.radius_m + layout.height_m
-        self._rotors: Rotors | LinearRotors = Rotors.of(config.rotors, layout, PHYSICS_DT_S) or LinearRotors(
-            layout.count, config.rotor_lag_s, PHYSICS_DT_S
-        )
-        self.battery = BatteryPack.of(
-            config.battery, config.battery_start, config.battery_life_s, self.weight_n, airframe
-        )
+        self._rotors: Rotors | LinearRotors = LinearRotors(layout.count, config.rotor_lag_s, PHYSICS_DT_S)
+        if config.rotors.on:
+            self._rotors = Rotors(config.rotors, layout, PHYSICS_DT_S)
+        self.battery: BatteryPack | None = None
         """The battery, or None if its effect is off."""
+        if config.battery.on:
+            full_s, charge = config.battery_life_s, config.battery_start
+            self.battery = BatteryPack(config.battery, charge, full_s, self.weight_n, airframe)
         self._standing_m = airframe.ground_clearance_m
         self.wind_m_s = config.wind_m_s
         self.rotor_share: Thrusts | None = None
@@ -104,13 +105,14 @@ class Machine:
         self.layout = _layout(joints, has_tether=vehicle.tether is not None, has_tip=has_tip(vehicle, config))
         sensor = int(model.sensor(f"{prefix}accel").adr[0])
         self._sensordata = data.sensordata[sensor : sensor + self.layout.sensor_count]
-        effects: tuple[Effect | None, ...] = (
-            Air.of(config.air, config.seed, bodies, self.weight_n),
-            Downwash.of(config, vehicle, bodies),
-            TetherLine.of(config.tether_line, vehicle.tether, self.tether, bodies),
-        )
-        self.effects = tuple(effect for effect in effects if effect is not None)
+        self.effects: list[Effect] = []
         """The active effects that load bodies."""
+        if config.air.on:
+            self.effects.append(Air(config.air, config.seed, bodies, self.weight_n))
+        if config.downwash.on:
+            self.effects.append(Downwash(config, vehicle, bodies))
+        if config.tether_line.on and vehicle.tether is not None:
+            self.effects.append(TetherLine(config.tether_line, vehicle.tether, self.tether, bodies))
         self._step = 0
         """Number of steps since the noise of the effects was last restarted."""
         self._place(start)

@@ -25,11 +25,6 @@ class Air:
         self._loads, self._base = bodies.loads, bodies.body("base")
         self.restart_noise()
 
-    @classmethod
-    def of(cls, config: AirConfig, seed: int, bodies: Bodies, weight_n: float) -> Air | None:
-        """Return the effect, or None if it is off."""
-        return cls(config, seed, bodies, weight_n) if config.on else None
-
     def restart_noise(self) -> None:
         """Restart the noise sequence."""
         self._gust = OrnsteinUhlenbeck(2, self._config.correlation_time_s, EFFECT_PERIOD_S, self._seed, _NOISE)

@@ -49,13 +49,6 @@ class BatteryPack:
         """Charge of the full battery in A s: the hover current at half charge multiplied by `life_s`."""
         self.restart()
 
-    @classmethod
-    def of(
-        cls, config: BatteryConfig, start: float, life_s: float, weight_n: float, airframe: Airframe
-    ) -> BatteryPack | None:
-        """Return the battery, or None if the effect is off."""
-        return cls(config, start, life_s, weight_n, airframe) if config.on else None
-
     def restart(self) -> None:
         """Reset the battery to its charge at arming."""
         self.drawn_as = 0.0

@@ -19,7 +19,6 @@ from companion.config.vehicle import Vehicle
 from companion.model.algebra import mat_vec, vec_mat
 from companion.model.rotors import RotorLayout
 from companion.model.types import Mat3, Vec3
-from companion.sitl_config.effects.downwash import Downwash as DownwashConfig
 from companion.sitl_config.world import World
 from sitl.world.effects.rotors import Thrusts
 from sitl.world.loads import EFFECT_PERIOD_S, Bodies
@@ -92,18 +91,11 @@ class Downwash:
         bodies: the model of the scene; the wakes load the arm and the net of the machine, and the payload.
     """
 
-    def __init__(
-        self,
-        config: DownwashConfig,
-        rotor_radius_m: float,
-        payload_radius_m: float,
-        vehicle: Vehicle,
-        bodies: Bodies,
-        seed: int,
-    ) -> None:
+    def __init__(self, world: World, vehicle: Vehicle, bodies: Bodies) -> None:
         model, data, self._loads, prefix = bodies
+        config, rotor_radius_m, payload_radius_m = world.downwash, world.rotors.radius_m, world.payload_radius_m
         self._cause = f"{prefix}downwash"
-        self._config, self._seed, self._intensity = config, seed, config.turbulence_intensity
+        self._config, self._seed, self._intensity = config, world.seed, config.turbulence_intensity
         layout = vehicle.airframe.rotor_layout
         self._wakes, self._height_m = Wakes(layout, rotor_radius_m, config.spread), layout.height_m
         self._radius_m = rotor_radius_m
@@ -126,13 +118,6 @@ class Downwash:
             if name in names
         )
         self.restart_noise()
-
-    @classmethod
-    def of(cls, config: World, vehicle: Vehicle, bodies: Bodies) -> Downwash | None:
-        """Return the effect of a world's configuration, or None if it is off."""
-        if not config.downwash.on:
-            return None
-        return cls(config.downwash, config.rotors.radius_m, config.payload_radius_m, vehicle, bodies, config.seed)
 
     def restart_noise(self) -> None:
         """Restart the noise sequence."""

@@ -47,11 +47,6 @@ class ForceSensor:
         self._rates, self._warm = config.drift_n_per_min, (config.warm_up_k, config.warm_up_s)
         self._per_k = config.temperature_drift_n_per_k
 
-    @classmethod
-    def of(cls, config: Config, seed: int) -> ForceSensor | None:
-        """Return the effect, or None if it is off."""
-        return cls(config, seed) if config.on else None
-
     def measure(self, t_s: float, force_n: Vec3, torque_nm: Vec3) -> tuple[Vec3, Vec3]:
         """Return the reading before noise, bias and rounding, in the sensor frame.
 

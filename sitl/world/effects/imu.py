@@ -63,11 +63,6 @@ class ImuErrors:
         self._accel_drift: Vec3 = (0.0, 0.0, 0.0)
         self._gyro_drift: Vec3 = (0.0, 0.0, 0.0)
 
-    @classmethod
-    def of(cls, config: Imu, interval_s: float, hover_n: float, layout: RotorLayout) -> ImuErrors | None:
-        """Return the errors, or None if the effect is off."""
-        return cls(config, interval_s, hover_n, layout) if config.on else None
-
     def drift(self, noise: Iterator[Vec3]) -> None:
         """Start the drift of the biases at zero; `noise` yields triples of standard normal numbers."""
         self._noise, self._tick = noise, 0

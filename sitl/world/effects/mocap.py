@@ -29,11 +29,6 @@ class MocapErrors:
         self._sent_s = 0.0
         self.restart(0.0)
 
-    @classmethod
-    def of(cls, config: Mocap, seed: int) -> MocapErrors | None:
-        """Return the errors, or None if the effect is off."""
-        return cls(config, seed) if config.on else None
-
     def restart(self, t_s: float) -> None:
         """Restart the random sequence of events and delays at world time `t_s`."""
         self._rng = np.random.default_rng((self._seed, _STREAM))

@@ -62,11 +62,6 @@ class Rotors:
         self._root = [0.0] * layout.count
         """Square root of each rotor's thrust in N^0.5, which is proportional to the rotor's speed."""
 
-    @classmethod
-    def of(cls, config: RotorsConfig, layout: RotorLayout, dt_s: float) -> Rotors | None:
-        """Return the rotors, or None if the effect is off."""
-        return cls(config, layout, dt_s) if config.on else None
-
     def step(self, signals: Sequence[float], full_n: float) -> Thrusts:
         """Advance by one physics step and return the thrust of each rotor in N, without the ground effect.
 

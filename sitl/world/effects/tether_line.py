@@ -85,11 +85,6 @@ class TetherLine:
         self._taut, self._loads, self._base = taut, bodies.loads, bodies.body("base")
         self._centre = bodies.data.xipos[self._base]
 
-    @classmethod
-    def of(cls, config: TetherLineConfig, tether: Tether | None, taut: TautTether, bodies: Bodies) -> TetherLine | None:
-        """Return the effect, or None if it is off or the vehicle has no tether."""
-        return cls(config, tether, taut, bodies) if config.on and tether is not None else None
-
     def restart_noise(self) -> None:
         """Do nothing: this effect has no noise."""
 

@@ -22,9 +22,7 @@ HOVER: Vec4 = (WEIGHT_N / 4.0,) * 4
 
 
 def pack(start: float = 1.0, life_s: float = 900.0, **changes: Any) -> BatteryPack:
-    made = BatteryPack.of(BatteryConfig(on=True, **changes), start, life_s, WEIGHT_N, VEHICLE.airframe)
-    assert made is not None
-    return made
+    return BatteryPack(BatteryConfig(on=True, **changes), start, life_s, WEIGHT_N, VEHICLE.airframe)
 
 
 @pytest.mark.parametrize("each_n", [0.0, 7.35, 12.0])

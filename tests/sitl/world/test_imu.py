@@ -36,9 +36,7 @@ STOPPED: Vec4 = (0.0, 0.0, 0.0, 0.0)
 
 
 def errors(interval_s: float = 0.004, **settings: Any) -> ImuErrors:
-    found = ImuErrors.of(Imu(on=True, **{**NOTHING, **settings}), interval_s, 1.0, LAYOUT)
-    assert found is not None
-    return found
+    return ImuErrors(Imu(on=True, **{**NOTHING, **settings}), interval_s, 1.0, LAYOUT)
 
 
 def test_biases_appear_in_px4s_axes() -> None:

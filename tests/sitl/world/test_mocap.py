@@ -30,9 +30,7 @@ ORIGIN = (0.0, 0.0, 0.0)
 
 
 def errors(**settings: Any) -> MocapErrors:
-    found = MocapErrors.of(Mocap(on=True, **{**NOTHING, **settings}), 1)
-    assert found is not None
-    return found
+    return MocapErrors(Mocap(on=True, **{**NOTHING, **settings}), 1)
 
 
 def test_the_plant_streams_pivot_yaw_and_tilt() -> None:

@@ -29,9 +29,7 @@ ALIKE = {"thrust_error": (0.0, 0.0, 0.0, 0.0), "yaw_torque_error": (0.0, 0.0, 0.
 
 
 def rotors(**changes: Any) -> Rotors:
-    made = Rotors.of(RotorsConfig(on=True, **changes), LAYOUT, PHYSICS_DT_S)
-    assert made is not None
-    return made
+    return Rotors(RotorsConfig(on=True, **changes), LAYOUT, PHYSICS_DT_S)
 
 
 def run(effect: Rotors, signals: Vec4, time_s: float) -> tuple[float, ...]:
