@@ -362,15 +362,7 @@ class Ack(Record, frozen=True, kw_only=True):
     """Proof for the operator who sent the command (`companion.ground.protocol.proof`)."""
 
 
-RECORDS: dict[Topic, type] = {
-    Topic.STATE: State,
-    Topic.SCENE: Scene,
-    Topic.PREFLIGHT: Preflight,
-    Topic.EVENTS: Events,
-    Topic.STREAM: Stream,
-    Topic.COMMAND: Command,
-    Topic.ACK: Ack,
-}
+RECORDS: dict[Topic, type] = dict(zip(Topic, (State, Scene, Preflight, Events, Stream, Command, Ack), strict=True))
 RETAINED = frozenset({Topic.STATE, Topic.SCENE, Topic.PREFLIGHT, Topic.EVENTS})
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from companion.config.base import Model, NonNegative, Positive
+from companion.config.base import NonNegative, Positive
+from companion.sitl_config.effects import Effect
 
 
-class Air(Model):
+class Air(Effect):
     """Gusts on the base. They grow with the rotors' thrust and are zero while the rotors are stopped."""
 
-    on: bool = False
-    """Whether this effect acts."""
     force_rms_n: NonNegative = 0.2
     """RMS of the force along each axis in hover far from the floor (e: 0.1 to 0.4)."""
     torque_rms_nm: NonNegative = 0.03

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from companion.config.base import Model, NonNegative, Positive
+from companion.config.base import NonNegative, Positive
+from companion.sitl_config.effects import Effect
 
 
-class Barometer(Model):
+class Barometer(Effect):
     """Errors of the barometric height. PX4 fuses it beside motion capture if EKF2_BARO_CTRL is 1, with a weight that hardly moves the
     estimate as long as there are poses; without poses it is the only measurement of the height.
     """
 
-    on: bool = False
-    """Whether this effect acts."""
     hover_m: float = 0.5
     """Error caused by the rotors' wake in hover, far from the floor, m. (e) ArduPilot, "Ground effect compensation", describes it."""
     floor_m: float = -1.0

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from companion.config.base import Model, NonNegative, Positive
+from companion.config.base import NonNegative, Positive
+from companion.sitl_config.effects import Effect
 
 
-class Battery(Model):
+class Battery(Effect):
     """True battery. Its capacity is the charge that a hover of `world.battery_life_s` draws. The values are those of four cells;
     resistance and voltage are scaled to the vehicle file's `airframe.battery_cells`."""
 
-    on: bool = False
-    """Whether this effect acts."""
     resistance_ohm: NonNegative = 0.028
     """Internal resistance with leads (p: 5 to 8 mohm per cell in good health, new packs 1 to 4, aged packs 8 to 12; e: leads 4)."""
     full_thrust_v: Positive = 16.0

@@ -6,17 +6,16 @@ from typing import Annotated
 
 from pydantic import Field
 
-from companion.config.base import Model, NonNegative
+from companion.config.base import NonNegative
+from companion.sitl_config.effects import Effect
 from companion.sitl_config.effects.servo_mechanics import GEAR_MIN_DEG_PER_NM
 
 DegPerNm = Annotated[float, Field(ge=GEAR_MIN_DEG_PER_NM, le=10)]
 
 
-class Compliance(Model):
+class Compliance(Effect):
     """Springs about the joints' axes, one in series with each joint, whose deflection the servos' encoders do not measure."""
 
-    on: bool = False
-    """Whether this effect acts."""
     mount_deg_per_nm: DegPerNm = 1.0
     """Tilt of the shoulder servo and its mount under the shoulder's torque, deg per N m (e: 0.5 to 2)."""
     link_deg_per_nm: DegPerNm = 1.0

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from companion.config.base import Model, NonNegative, Positive
+from companion.config.base import NonNegative, Positive
+from companion.sitl_config.effects import Effect
 
 
-class Downwash(Model):
+class Downwash(Effect):
     """The four wakes and their drag on arm, net and payload. The radius of a rotor is `rotors.radius_m`, even if that effect is off."""
 
-    on: bool = False
-    """Whether this effect acts."""
     spread: Positive = 0.2
     """Standard deviation of the sideways spread of a wake's momentum, divided by the distance below the rotor. The four wakes merge
     into one jet at the depth where the spread equals the rotors' distance from the vehicle's planes of symmetry, 0.23 m: with 0.14 at

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from companion.config.base import Fraction, Model, NonNegative, Positive, Vector3
+from companion.config.base import Fraction, NonNegative, Positive, Vector3
+from companion.sitl_config.effects import Effect
 
 
-class ForceSensor(Model):
+class ForceSensor(Effect):
     """Errors of the force-torque sensor. `world.force_noise_n`, `world.force_bias_n` and `world.force_scale` also act without this
     effect.
     """
 
-    on: bool = False
-    """Whether this effect acts."""
     resolution_n: NonNegative = 0.2
     """Smallest step of a force reading; 0 for the step of the serial protocol. (m) 0.2 for the RFT40-SA01, (e) the same for this
     sensor.

@@ -9,14 +9,13 @@ from typing import Annotated
 
 from pydantic import Field
 
-from companion.config.base import Model, NonNegative, Positive, Vector3
+from companion.config.base import NonNegative, Positive, Vector3
+from companion.sitl_config.effects import Effect
 
 
-class Imu(Model):
+class Imu(Effect):
     """Errors of the IMU, in the axes of the autopilot board: forward, left, up."""
 
-    on: bool = False
-    """Whether this effect acts."""
     accel_bias_m_s2: Vector3 = (0.1, -0.08, 0.1)
     """Remaining bias of each accelerometer after calibration. (m) 0.5 mg/K and 1 mg/K for the vertical axis (ICM-20602), or 0.15 mg/K
     (ICM-42688-P), at 10 to 20 K from the calibration temperature."""

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from companion.config.base import Model, RelativeError, Vector3
+from companion.config.base import RelativeError, Vector3
+from companion.sitl_config.effects import Effect
 from companion.sitl_config.per_joint import LengthError, LengthErrors
 
 
-class Machine(Model):
+class Machine(Effect):
     """Geometry, centre of mass and inertia of the real vehicle. `world.mass_error`, `world.link_mass_error` and
     `world.hover_thrust_error` also act without this effect.
     """
 
-    on: bool = False
-    """Whether this effect acts."""
     centre_of_mass_m: tuple[LengthError, LengthError, LengthError] = (0.006, -0.004, 0.005)
     """True centre of mass of the base (without arm and tool) in the body frame. The vehicle file and PX4 assume the body's origin.
     (e) within 0.01 on each axis: battery and cables are placed by hand, the motion-capture pivot according to a drawing.

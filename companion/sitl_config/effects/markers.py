@@ -10,14 +10,13 @@ from typing import Annotated
 
 from pydantic import Field
 
-from companion.config.base import Model, NonNegative, Positive, Vector3
+from companion.config.base import NonNegative, Positive, Vector3
+from companion.sitl_config.effects import Effect
 
 
-class Markers(Model):
+class Markers(Effect):
     """Errors of single markers. Without this effect, the cameras see every ball in every frame, and nothing else."""
 
-    on: bool = False
-    """Whether this effect acts."""
     noise_m: NonNegative = 0.001
     """Standard deviation per axis of a ball's position, in addition to `mocap_noise_m`: tape covers it unevenly. (p) Merriaux et al.,
     Sensors 17 (2017): below 2 mm in motion."""

@@ -9,14 +9,13 @@ from typing import Annotated
 
 from pydantic import Field
 
-from companion.config.base import Model, NonNegative, Positive, Vector2, Vector3
+from companion.config.base import NonNegative, Positive, Vector2, Vector3
+from companion.sitl_config.effects import Effect
 
 
-class Mocap(Model):
+class Mocap(Effect):
     """Errors of the rigid body's pose, and lost frames."""
 
-    on: bool = False
-    """Whether this effect acts."""
     pivot_offset_m: Vector3 = (0.008, -0.006, 0.01)
     """Position of the rigid body's pivot in the body frame; the vehicle file assumes the body's origin. (e) 5 to 20 mm: the
     pivot is placed by eye or at a marker, and the centre of mass moves with the battery."""

@@ -6,15 +6,14 @@ from typing import Annotated
 
 from pydantic import Field
 
-from companion.config.base import Fraction, Model, Positive
+from companion.config.base import Fraction, Positive
+from companion.sitl_config.effects import Effect
 
 
-class Net(Model):
+class Net(Effect):
     """A hoop with a bag of elastic mesh. A payload counts as caught once it has been in the bag for 0.4 s; the time of the catch is the
     time of its first contact. Without this effect, the payload is fixed to the net at the point where it touches the net."""
 
-    on: bool = False
-    """Whether this effect acts."""
     bag_depth_m: Annotated[float, Field(ge=0.05, le=0.5)] = 0.10
     """Depth of the payload's centre below the hoop at which the mesh is just taut; also the length of the pendulum (e)."""
     bag_stiffness_n_m: Annotated[float, Field(gt=0, le=5000)] = 500.0

@@ -8,9 +8,10 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from companion.config.base import Fraction, Model, NonNegative, Positive, RelativeError
+from companion.config.base import Fraction, NonNegative, Positive, RelativeError
 from companion.config.document import Document
 from companion.model.rotors import ROTORS_MAX
+from companion.sitl_config.effects import Effect
 
 BODY_DRAG_N_PER_M_S: Final = 0.25
 """Drag of the body over its airspeed in every world, in addition to that of the rotors."""
@@ -34,11 +35,9 @@ def of_rotors(errors: Sequence[float], count: int) -> tuple[float, ...]:
     return tuple(islice(cycle(errors), count))
 
 
-class Rotors(Model):
+class Rotors(Effect):
     """The rotors of the simulated world. At full signal, their nominal total thrust is the vehicle file's `thrust_max_n`."""
 
-    on: bool = False
-    """Whether this effect acts."""
     thrust_curve: Fraction = 0.5
     """f of the true static curve: thrust / full thrust = f s^2 + (1 - f) s at motor signal s. PX4's multirotor airframes set 0.25 to
     0.35 (p: ROMFS/px4fmu_common/init.d/airframes); ArduPilot's default for the same curve is 0.65 (p: MOT_THST_EXPO).

@@ -6,7 +6,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from companion.config.base import Model, NonNegative, Positive
+from companion.config.base import NonNegative, Positive
+from companion.sitl_config.effects import Effect
 from companion.sitl_config.per_joint import RelativeErrors
 
 GEAR_MIN_DEG_PER_NM = 0.15
@@ -16,7 +17,7 @@ GEAR_MIN_DEG_PER_NM = 0.15
 Share = Annotated[float, Field(ge=0, lt=0.5)]
 
 
-class ServoMechanics(Model):
+class ServoMechanics(Effect):
     """Current loop, torque constant, friction, backlash and gear stiffness of the servos.
 
     The friction model is M4 of Duclusaud et al., "Extended Friction Models for the Physics Simulation of Servo Actuators" (ICRA 2025),
@@ -24,8 +25,6 @@ class ServoMechanics(Model):
     scaled from those of the MX-64 and the MX-106 by stall torque (3.0 against 6.0 and 8.4 N m at 12 V).
     """
 
-    on: bool = False
-    """Whether this effect acts."""
     torque_per_amp_error: RelativeErrors = (0.0, 0.0)
     """Relative errors of the vehicle file's torque constant with respect to each servo's true constant, from the shoulder outwards, in
     addition to those in `servos`. The last value also holds for further servos, and surplus values are ignored (m: the MX-106's differs

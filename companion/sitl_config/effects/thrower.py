@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from companion.config.base import Model, NonNegative, Positive, Vector3
+from companion.sitl_config.effects import Effect
 
 
 class Person(Model):
@@ -14,13 +15,11 @@ class Person(Model):
     """Time from the throw to the arrival at the net: a long flight is a lob."""
 
 
-class Thrower(Model):
+class Thrower(Effect):
     """A person who throws the payload. Every value is a standard deviation; the errors are drawn anew for each throw. Without this
     effect, each throw meets the predicted position of the net with `throw_velocity_m_s`.
     """
 
-    on: bool = False
-    """Whether this effect acts."""
     scatter: NonNegative = 1.0
     """Factor on every error below: 1 for a skilled person, 3 for a person without practice, 6 for a careless one (e)."""
     speed_error: NonNegative = 0.02
