@@ -265,16 +265,7 @@ class Flight:
             ipc.send(self._channel, GroundText(ground))
 
     def _tell(self, tick: int, outputs: Outputs, event: Event) -> None:
-        message = FlightEvent(
-            tick=tick,
-            t_s=event.t_s,
-            mission_t_s=outputs.mission_time_s(event),
-            id=event.id,
-            severity=event.severity,
-            action=event.action,
-            text=event.text,
-        )
-        ipc.send(self._channel, message)
+        ipc.send(self._channel, FlightEvent.of(event, tick, outputs.mission_time_s(event)))
 
 
 def status_of(outputs: Outputs, sent: Sent) -> Status:

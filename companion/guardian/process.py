@@ -24,7 +24,7 @@ from companion.guardian.link import Link
 from companion.guardian.mocap import GuardianMocap
 from companion.guardian.monitors import StallWatch
 from companion.guardian.settings import Settings, read_settings
-from companion.guardian.takeover_landing import Notice, TakeoverLanding
+from companion.guardian.takeover_landing import TakeoverLanding, notice
 from companion.io.protocols import DeviceError
 from companion.io.px4.wire import OpenWire, is_udp, open_wire
 from companion.io.reopening import Reopening
@@ -33,7 +33,7 @@ from companion.model.codec import to_packet
 from companion.model.launcher_messages import FlightEvent, GuardianEnded, GuardianStatus, TookOver
 from companion.model.packets import LogLine
 from companion.model.team import Grip, TeamState
-from companion.model.types import SafetyAction, Severity, Vec3
+from companion.model.types import Event, Severity, Vec3
 from companion.runtime import ipc, simulated_time
 from companion.runtime.clock import monotonic
 from companion.runtime.realtime import GUARDIAN_PRIORITY, claim_realtime
@@ -153,7 +153,7 @@ class Guardian:
         text = f"{reason}; the guardian has taken over" + (
             "" if gone else " (the flight process was killed but has not ended)"
         )
-        self._publish(last, Notice(now_s, "guardian_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
+        self._publish(last, notice(now_s, "guardian_took_over", Severity.CRITICAL, text))
         link = self._open_link(last)
         if link is None:
             self._send_result(False, None)
@@ -201,7 +201,7 @@ class Guardian:
             self._link_reported = True
             text = f"autopilot {self._settings.autopilot_address}: {found}; trying again"
             now_s = monotonic() - last.origin_s
-            self._publish(last, Notice(now_s, "guardian_no_link", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
+            self._publish(last, notice(now_s, "guardian_no_link", Severity.CRITICAL, text))
 
     def _restore_link(self, last: Heartbeat, link: Link, landing: TakeoverLanding, waiting: select.poll) -> None:
         """Close a lost link, because it would end every wait at once, and use it again once it is open again."""
@@ -265,10 +265,7 @@ class Guardian:
             if text not in self._errors and len(self._errors) < ERRORS_REPORTED_MAX:
                 self._errors.add(text)
                 _log_line(traceback.format_exc())
-                self._publish(
-                    last,
-                    Notice(t_s, "guardian_error", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text[:ERROR_CHARS]),
-                )
+                self._publish(last, notice(t_s, "guardian_error", Severity.CRITICAL, text[:ERROR_CHARS]))
             if what == "the landing":
                 landing.restart(t_s)
 
@@ -286,22 +283,13 @@ class Guardian:
             self._status_s = now_s
             ipc.send(self._channel, GuardianStatus())
 
-    def _publish(self, last: Heartbeat, notice: Notice) -> None:
-        """Send a notice to the launcher and to the log."""
-        mission_t_s = last.mission_t_s + notice.t_s - last.t_s if last.mission_t_s else 0.0
-        message = FlightEvent(
-            tick=last.tick,
-            t_s=notice.t_s,
-            mission_t_s=mission_t_s,
-            id=notice.id,
-            severity=notice.severity,
-            action=notice.action,
-            text=notice.text,
-        )
-        ipc.send(self._channel, message)
-        _log_line(f"{notice.t_s:.3f} {notice.id}: {notice.text}")
+    def _publish(self, last: Heartbeat, event: Event) -> None:
+        """Send an event to the launcher and to the log."""
+        mission_t_s = last.mission_t_s + event.t_s - last.t_s if last.mission_t_s else 0.0
+        ipc.send(self._channel, FlightEvent.of(event, last.tick, mission_t_s))
+        _log_line(f"{event.t_s:.3f} {event.id}: {event.text}")
         if self._heartbeats.recorder is not None:
-            packet = to_packet(LogLine(t_s=notice.t_s, severity=notice.severity, source=notice.id, text=notice.text))
+            packet = to_packet(LogLine(t_s=event.t_s, severity=event.severity, source=event.id, text=event.text))
             with contextlib.suppress(OSError):
                 self._heartbeats.recorder.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
 

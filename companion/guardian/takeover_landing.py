@@ -8,7 +8,6 @@ an argument.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -21,6 +20,7 @@ from companion.model.flight_stage import is_killed
 from companion.model.types import (
     AutopilotRequest,
     AutopilotStatus,
+    Event,
     FlightMode,
     Inputs,
     MocapPose,
@@ -64,18 +64,12 @@ _STREAMS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Notice:
-    """An event for the log, the summary and the display."""
-
-    t_s: float
-    id: str
-    severity: Severity
-    action: SafetyAction
-    text: str
+Notify = Callable[[Event], None]
 
 
-Notify = Callable[[Notice], None]
+def notice(t_s: float, event_id: str, severity: Severity, text: str) -> Event:
+    """Return an event of the guardian, with which PX4 lands or has landed."""
+    return Event(t_s=t_s, id=event_id, severity=severity, action=SafetyAction.AUTOPILOT_LAND, text=text)
 
 
 class TakeoverLanding:
@@ -308,7 +302,7 @@ class TakeoverLanding:
         """Report an event, once per id and text."""
         if event_id + text not in self._notified:
             self._notified.add(event_id + text)
-            self._notify(Notice(t_s, event_id, severity, SafetyAction.AUTOPILOT_LAND, text))
+            self._notify(notice(t_s, event_id, severity, text))
 
 
 def _last_pose(last: Heartbeat) -> MocapPose | None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
+
 from companion.model.check_row import Row
 from companion.model.codec import Record
-from companion.model.types import OperatorCommand, Outcome, PhaseKind, SafetyAction, Severity, Vec3
+from companion.model.types import Event, OperatorCommand, Outcome, PhaseKind, SafetyAction, Severity, Vec3
 
 
 class Status(Record, frozen=True, kw_only=True, tag=True):
@@ -35,6 +37,11 @@ class FlightEvent(Record, frozen=True, kw_only=True, tag=True):
     severity: Severity
     action: SafetyAction
     text: str
+
+    @staticmethod
+    def of(event: Event, tick: int, mission_t_s: float) -> FlightEvent:
+        """Return the message about an event."""
+        return FlightEvent(tick=tick, mission_t_s=mission_t_s, **msgspec.structs.asdict(event))
 
     @property
     def ends_flight(self) -> bool:

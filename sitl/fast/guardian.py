@@ -17,9 +17,9 @@ from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.monitors import StallWatch
 from companion.guardian.process import PERIOD_S
-from companion.guardian.takeover_landing import Notice, Notify, TakeoverLanding
+from companion.guardian.takeover_landing import Notify, TakeoverLanding, notice
 from companion.model.outputs import Outputs
-from companion.model.types import Event, Inputs, LinkIdentity, MocapPose, SafetyAction, Severity
+from companion.model.types import Event, Inputs, LinkIdentity, MocapPose, Severity
 from companion.safety.mocap import limits_of
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.receive import Receiver
@@ -147,18 +147,13 @@ class FastGuardian:
             else f"the flight process hangs (silent for {self._watch.silent_s * 1e3:.0f} ms)"
         )
         text = f"{reason}; the guardian has taken over"
-        self._notify(Notice(t_s, "guardian_took_over", Severity.CRITICAL, SafetyAction.AUTOPILOT_LAND, text))
+        self.events.append(notice(t_s, "guardian_took_over", Severity.CRITICAL, text))
         return True
 
     def take_over(self, t_s: float) -> Landing:
         """Take control of the vehicle and return the landing."""
         assert self._beat is not None
-        return Landing(self._beat, self._vehicle, self._px4, t_s, self._notify)
-
-    def _notify(self, notice: Notice) -> None:
-        self.events.append(
-            Event(t_s=notice.t_s, id=notice.id, severity=notice.severity, action=notice.action, text=notice.text)
-        )
+        return Landing(self._beat, self._vehicle, self._px4, t_s, self.events.append)
 
 
 class Landing:

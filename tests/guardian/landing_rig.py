@@ -11,9 +11,9 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.config.safety import Safety
 from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
-from companion.guardian.takeover_landing import Notice, TakeoverLanding
+from companion.guardian.takeover_landing import TakeoverLanding
 from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
-from companion.model.types import MocapPose, Quat, Vec3
+from companion.model.types import Event, MocapPose, Quat, Vec3
 from companion.safety.mocap import limits_of
 
 STANDING_M, TILT_MAX_RAD = 0.3, math.radians(40.0)
@@ -82,7 +82,7 @@ class Landing:
 
     def __init__(self, last: Heartbeat) -> None:
         self.wire = Wire()
-        self.notices: list[Notice] = []
+        self.notices: list[Event] = []
         self.t_s = START_S
         link = Link(self.wire, (1, 191), 1)
         self.takeover = TakeoverLanding(last, STANDING_M, TILT_MAX_RAD, LIMITS, link, START_S, self.notices.append)
