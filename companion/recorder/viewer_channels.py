@@ -54,7 +54,7 @@ from companion.recorder.viewer_scene import (
     MEETING,
     path_of,
     point3,
-    rotor_circle,
+    rotor_disk,
     sphere,
     static_entities,
     tether_colour,
@@ -143,14 +143,14 @@ class ViewerChannels:
         if scene_due:
             self._scene_due_s = t_s
             if pose is not None:
-                self._tether(stamp, stamp_ns, pose, outputs.tether)
+                self._tether(stamp_ns, pose, outputs.tether)
             if outputs.ball is not None:
-                self._ball(stamp, stamp_ns, outputs.ball)
+                self._ball(stamp_ns, outputs.ball)
             if inputs.bar is not None and inputs.bar.tracking_valid and t_s - inputs.bar.stamp_s <= _FRESH_S:
-                self._bar(stamp, stamp_ns, inputs.bar)
+                self._bar(stamp_ns, inputs.bar)
             partner = inputs.partner
             if partner is not None and not self._prefix and t_s - partner.stamp_s <= _FRESH_S:
-                self._partner(stamp, stamp_ns, partner.said.position_world_m)
+                self._partner(stamp_ns, partner.said.position_world_m)
             self._paths(t_s, stamp, stamp_ns, pose, outputs.reference)
 
     def _frames(
@@ -176,7 +176,12 @@ class ViewerChannels:
             turned = (math.cos(half), 0.0, 0.0, math.sin(half)) if math.isfinite(half) else (math.nan,) * 4
             _log_pose(self._reference, stamp, stamp_ns, reference.position_world_m, turned)
 
-    def _tether(self, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat], watched: TetherState | None) -> None:
+    def _show(self, stamp_ns: int, name: str, **shapes: Any) -> None:
+        """Write one entity that moves."""
+        entity = SceneEntity(timestamp=timestamp(stamp_ns), frame_id="world", id=name, lifetime=_LIFETIME, **shapes)
+        self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
+
+    def _tether(self, stamp_ns: int, pose: tuple[Vec3, Quat], watched: TetherState | None) -> None:
         geometry = self._geometry
         if geometry is None or (tether := geometry.tether) is None:
             return
@@ -187,39 +192,30 @@ class ViewerChannels:
         held = watched is not None and (watched.taut or watched.snagged)
         points = hanging_line_m(tether.anchor_world_m, end, tether.length_m, geometry.room_min_world_m[2])
         line = trail([point3(p) for p in points], tether_colour(tether, slack_m, held=held), 4.0)
-        entity = SceneEntity(timestamp=stamp, frame_id="world", id="tether", lifetime=_LIFETIME, lines=[line])
-        self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
+        self._show(stamp_ns, "tether", lines=[line])
 
-    def _ball(self, stamp: Timestamp, stamp_ns: int, ball: BallState) -> None:
+    def _ball(self, stamp_ns: int, ball: BallState) -> None:
         balls = [sphere(ball.position_world_m, BALL_M, BALL)]
         if ball.meeting_world_m is not None:
             net_m = self._geometry.net_radius_m if self._geometry is not None else 0.0
             balls.append(sphere(ball.meeting_world_m, net_m or BALL_M, MEETING))
         if not math.isfinite(sum(ball.position_world_m) + sum(ball.meeting_world_m or ())):
             return
-        entity = SceneEntity(timestamp=stamp, frame_id="world", id="ball", lifetime=_LIFETIME, spheres=balls)
-        self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
+        self._show(stamp_ns, "ball", spheres=balls)
 
-    def _bar(self, stamp: Timestamp, stamp_ns: int, bar: BarPose) -> None:
+    def _bar(self, stamp_ns: int, bar: BarPose) -> None:
         if self._bar_m is None or not _usable(bar.position_world_m, bar.attitude_wxyz):
             return
         (x, y, z), (dx, dy, dz) = bar.position_world_m, quat_rotate(bar.attitude_wxyz, (0.5 * self._bar_m, 0.0, 0.0))
         ends = (x + dx, y + dy, z + dz), (x - dx, y - dy, z - dz)
         line, handles = trail([point3(end) for end in ends], BAR, 8.0), [sphere(end, HANDLE_M, BAR) for end in ends]
-        entity = SceneEntity(
-            timestamp=stamp, frame_id="world", id="bar", lifetime=_LIFETIME, lines=[line], spheres=handles
-        )
-        self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
+        self._show(stamp_ns, "bar", lines=[line], spheres=handles)
 
-    def _partner(self, stamp: Timestamp, stamp_ns: int, position_world_m: Vec3) -> None:
+    def _partner(self, stamp_ns: int, position_world_m: Vec3) -> None:
         """Write where the other vehicle of a team is, as a disk of this one's size; a file with both vehicles shows it whole."""
         if self._geometry is None or not _usable(position_world_m, (1.0, 0.0, 0.0, 0.0)):
             return
-        disk = rotor_circle(position_world_m, self._geometry.radius_m)
-        entity = SceneEntity(
-            timestamp=stamp, frame_id="world", id="other vehicle", lifetime=_LIFETIME, cylinders=[disk]
-        )
-        self._scene.log(SceneUpdate(entities=[entity]), log_time=stamp_ns)
+        self._show(stamp_ns, "other vehicle", cylinders=[rotor_disk(position_world_m, self._geometry.radius_m, 0.02)])
 
     def _paths(
         self, t_s: float, stamp: Timestamp, stamp_ns: int, pose: tuple[Vec3, Quat] | None, reference: Reference | None

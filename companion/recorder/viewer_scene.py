@@ -109,22 +109,8 @@ def _airframe(geometry: Geometry) -> dict[str, Any]:
     rotor_m = max(0.0, geometry.disk_radius_m)
     offset_m = rotors.arm_m * math.sqrt(0.5) / 2.0
     corners = [(x * offset_m, y * offset_m) for x, y in ((1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0), (1.0, -1.0))]
-    flat = Vector3(x=2.0 * rotor_m, y=2.0 * rotor_m, z=0.01)
-    disks = [
-        CylinderPrimitive(
-            pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=_UPRIGHT),
-            size=flat,
-            bottom_scale=1.0,
-            top_scale=1.0,
-            color=_ROTOR,
-        )
-        for x, y, z in rotors.positions_body_m
-    ]
-    hub = CubePrimitive(
-        pose=Pose(position=Vector3(x=0.0, y=0.0, z=0.0), orientation=_UPRIGHT),
-        size=Vector3(x=0.16, y=0.12, z=0.06),
-        color=_DARK,
-    )
+    disks = [rotor_disk(centre, rotor_m, 0.01) for centre in rotors.positions_body_m]
+    hub = CubePrimitive(pose=_pose((0.0, 0.0, 0.0)), size=Vector3(x=0.16, y=0.12, z=0.06), color=_DARK)
     booms = [end for x, y, z in rotors.positions_body_m for end in ((0.0, 0.0, z - 0.01), (x, y, z - 0.01))]
     booms += [end for x, y in corners for end in ((x, y, 0.0), (x, y, -clearance_m))]
     nose = _segments([(0.08, 0.0, 0.0), (geometry.radius_m, 0.0, 0.0)], _NOSE, 4.0)
@@ -156,32 +142,24 @@ def _rod(end: Vec3) -> CylinderPrimitive:
     w, qx, qy = length_m + z, -y, x
     norm = math.hypot(w, qx, qy)
     along = Quaternion(w=w / norm, x=qx / norm, y=qy / norm, z=0.0) if norm > 0.0 else _DOWN
-    return CylinderPrimitive(
-        pose=Pose(position=Vector3(x=x / 2, y=y / 2, z=z / 2), orientation=along),
-        size=Vector3(x=0.025, y=0.025, z=length_m),
-        bottom_scale=1.0,
-        top_scale=1.0,
-        color=_LINK,
-    )
+    return _cylinder(_pose((x / 2, y / 2, z / 2), along), Vector3(x=0.025, y=0.025, z=length_m), _LINK)
 
 
-def rotor_circle(centre: Vec3, radius_m: float) -> CylinderPrimitive:
-    """Return a flat disk that covers the rotors of a vehicle."""
-    x, y, z = centre
-    return CylinderPrimitive(
-        pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=_UPRIGHT),
-        size=Vector3(x=2.0 * radius_m, y=2.0 * radius_m, z=0.02),
-        bottom_scale=1.0,
-        top_scale=1.0,
-        color=_ROTOR,
-    )
+def rotor_disk(centre: Vec3, radius_m: float, height_m: float) -> CylinderPrimitive:
+    """Return a flat disk that covers a rotor, or all rotors of a vehicle."""
+    return _cylinder(_pose(centre), Vector3(x=2.0 * radius_m, y=2.0 * radius_m, z=height_m), _ROTOR)
 
 
 def sphere(centre: Vec3, radius_m: float, colour: Color) -> SpherePrimitive:
     """Return a sphere."""
     wide = 2.0 * radius_m
-    return SpherePrimitive(
-        pose=Pose(position=Vector3(x=centre[0], y=centre[1], z=centre[2]), orientation=_UPRIGHT),
-        size=Vector3(x=wide, y=wide, z=wide),
-        color=colour,
-    )
+    return SpherePrimitive(pose=_pose(centre), size=Vector3(x=wide, y=wide, z=wide), color=colour)
+
+
+def _pose(position: Vec3, attitude: Quaternion = _UPRIGHT) -> Pose:
+    x, y, z = position
+    return Pose(position=Vector3(x=x, y=y, z=z), orientation=attitude)
+
+
+def _cylinder(pose: Pose, size: Vector3, colour: Color) -> CylinderPrimitive:
+    return CylinderPrimitive(pose=pose, size=size, bottom_scale=1.0, top_scale=1.0, color=colour)
