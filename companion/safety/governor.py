@@ -17,6 +17,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import msgspec
+
 from companion.config.mission import Limits
 from companion.config.vehicle import Vehicle
 from companion.model.codec import Record
@@ -171,19 +173,12 @@ class Governor:
         if self._restrained:
             self._tighten()
         assert self._p is not None
-        constrained = Reference(
+        constrained = msgspec.structs.replace(
+            reference,
             position_world_m=self._p,
             velocity_world_m_s=self._v,
             acceleration_world_m_s2=acceleration,
-            yaw_rad=reference.yaw_rad,
-            yaw_rate_rad_s=reference.yaw_rate_rad_s,
-            arm_rad=reference.arm_rad,
-            arm_rate_rad_s=reference.arm_rate_rad_s,
-            arm_acceleration_rad_s2=reference.arm_acceleration_rad_s2,
             jerk_world_m_s3=(0.0, 0.0, 0.0),
-            push_world_n=reference.push_world_n,
-            slide_world_n=reference.slide_world_n,
-            steer_rad=reference.steer_rad,
         )
         return Governed(constrained, reasons)
 
