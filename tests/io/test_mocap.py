@@ -28,6 +28,8 @@ from tests.io.refusal import refusal
 from tests.support import DEADLINE_S
 
 GROUP = "239.255.42.99"
+IP_DROP_SOURCE_MEMBERSHIP = 40
+"""From linux/in.h."""
 POSE = BodyPose(1, (-1.25, 0.5, 1.0), (0.5, -0.5, 0.5, 0.5), error_m=0.00025)
 STRANGER = BodyPose(4, (3.0, 3.0, 0.0), (1.0, 0.0, 0.0, 0.0))
 Transport = Literal["multicast", "unicast"]
@@ -155,6 +157,21 @@ async def test_two_listeners_share_the_multicast_port() -> None:
         async with mocap(device) as flight, mocap(device) as guardian:
             assert flight.latest() is not None
             assert guardian.latest() is not None
+
+
+async def test_a_socket_that_has_lost_its_multicast_group_joins_it_again() -> None:
+    """As after a USB network adapter was unplugged and plugged in again: the kernel forgets its groups."""
+    inbox = Inbox()
+    async with (
+        NatNetServer(multicast_group=GROUP) as server,
+        streaming(server, POSE),
+        mocap(device_for(server, "multicast"), inbox) as edge,
+    ):
+        member = socket.inet_aton(GROUP) + socket.inet_aton("127.0.0.1") * 2  # struct ip_mreq_source
+        edge.client.extended.sockets[-1].setsockopt(socket.IPPROTO_IP, IP_DROP_SOURCE_MEMBERSHIP, member)
+        edge.client.poses()  # those that arrived before
+        inbox.clear()
+        await inbox.next()
 
 
 async def test_leaving_unsubscribes_and_frees_the_sockets() -> None:

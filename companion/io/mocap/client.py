@@ -27,6 +27,8 @@ ECHOES_WAITING: Final = 8
 """Number of newest echo requests whose answers are accepted."""
 RECONNECT_SILENCE_S: Final = 1.0
 """Silence after which a connect request is sent: a restarted server knows its clients only after a new one."""
+FRAMES_SILENCE_S: Final = 0.1
+"""Silence after which frames have stopped."""
 
 
 class NatNetClient:
@@ -95,6 +97,10 @@ class NatNetClient:
         self._echo_sent_s[self._token] = now_s
         requests.append(natnet.encode_echo_request(self._token))
         return requests
+
+    def is_silent(self, now_s: float) -> bool:
+        """Return whether frames have arrived, but none for a while."""
+        return self._last_number is not None and now_s - self._last_frame_s > FRAMES_SILENCE_S
 
     @property
     def request_period_s(self) -> float:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import math
 import socket
+import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
@@ -67,6 +69,8 @@ class OptiTrack(ExtendedClient):
         self._sent_s = -math.inf
         self._described = False
         """Whether the bodies' names have been requested."""
+        self._joining = threading.Thread()
+        """Joins the multicast group again."""
         try:
             self._command = self._open(settings.interface, 0, "interface")
             if settings.transport == "multicast":  # a unicast server sends frames to the address of the requests
@@ -111,7 +115,10 @@ class OptiTrack(ExtendedClient):
         return self.protocol.two_streams
 
     def keep_connected(self, now_s: float) -> None:
-        """Send connect requests, keep-alives and echo requests when they are due, and ask once for the bodies' names."""
+        """Send connect requests, keep-alives and echo requests when they are due, and ask once for the bodies' names.
+
+        If frames have stopped, join the multicast group again: a network interface that was unplugged and comes back is in no group.
+        """
         protocol = self.protocol
         if protocol.version is not None and not self._described:
             self._described, self._sent_s = True, -math.inf
@@ -122,6 +129,9 @@ class OptiTrack(ExtendedClient):
         if now_s - self._sent_s >= _DUE * protocol.request_period_s:
             self._sent_s = now_s
             self._send(protocol.requests(now_s))
+        if self._settings.transport == "multicast" and protocol.is_silent(now_s) and not self._joining.is_alive():
+            self._joining = threading.Thread(target=self._join_again, args=(self.sockets[-1].dup(),), daemon=True)
+            self._joining.start()
 
     def poses(self, now_s: float) -> list[MocapPose]:
         """Return the body's poses that have arrived, in order, stamped with their arrival."""
@@ -249,6 +259,11 @@ class OptiTrack(ExtendedClient):
                 f"{self.where}: cannot join {group} on {interface} ({error}); "
                 "set devices.mocap.interface to this computer's address on the camera network"
             ) from None
+
+    def _join_again(self, data: socket.socket) -> None:
+        """Join the multicast group, unless the interface is missing or still in the group; in a thread, because the kernel may wait."""
+        with data, contextlib.suppress(OSError):
+            sockets.join_source(data, self._settings.multicast_group, self._settings.interface, self.server_ip)
 
     def _send(self, datagrams: list[bytes]) -> None:
         """Send datagrams; while the network is down they are dropped, and the next ones may get through."""

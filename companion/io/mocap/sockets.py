@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
 import socket
 from collections.abc import Iterator
 from typing import Final, NamedTuple
@@ -10,6 +12,7 @@ from companion.io.arrival import STAMP_ROOM_BYTES, stamp_arrivals
 
 _IP_ADD_SOURCE_MEMBERSHIP: Final = 39
 """From linux/in.h; `socket` defines the name since Python 3.12."""
+_libc = ctypes.CDLL(None, use_errno=True)
 _MAX_DATAGRAMS: Final = 256
 """Limit per call of `waiting`, so that a flood does not block the caller."""
 _MAX_BYTES: Final = 65535
@@ -58,7 +61,10 @@ def join_source(opened: socket.socket, group: str, interface: str, source: str) 
         OSError: no such interface, or not a multicast address.
     """
     request = socket.inet_aton(group) + socket.inet_aton(interface) + socket.inet_aton(source)  # struct ip_mreq_source
-    opened.setsockopt(socket.IPPROTO_IP, _IP_ADD_SOURCE_MEMBERSHIP, request)
+    # Unlike `socket.setsockopt`, ctypes releases the interpreter while the kernel waits for an interface that is being set up.
+    if _libc.setsockopt(opened.fileno(), socket.IPPROTO_IP, _IP_ADD_SOURCE_MEMBERSHIP, request, len(request)):
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
 
 
 def waiting(opened: socket.socket) -> Iterator[Datagram]:
