@@ -323,6 +323,7 @@ class ServoModel:
 
     def _power_on(self) -> None:
         self._reset_goals()
+        self._memory[64] = self._get(reg.STARTUP) & 1
         self._settings_to_drive()
         self.drive.forget_turns()
         self._check_environment()

@@ -77,6 +77,8 @@ VELOCITY_LIMIT = _read_write(44, 4, "velocity limit", 330, 0, 1023)
 MAX_POSITION_LIMIT = _read_write(48, 4, "max position limit", 4095, 0, 4095)
 MIN_POSITION_LIMIT = _read_write(52, 4, "min position limit", 0, 0, 4095)
 SECONDARY_ID = _read_write(12, 1, "secondary id", 255, 0, 255)
+STARTUP = _read_write(60, 1, "startup configuration", 0, 0, 3)
+"""Bit 0: torque on after a restart. Bit 1: restored RAM, which the emulator does not have."""
 SHUTDOWN = _read_write(63, 1, "shutdown", 52, 0, 255)
 TORQUE_ENABLE = _read_write(64, 1, "torque enable", 0, 0, 1)
 LED = _read_write(65, 1, "led", 0, 0, 1)
@@ -125,7 +127,7 @@ _PLAIN = (
     VELOCITY_LIMIT,
     MAX_POSITION_LIMIT,
     MIN_POSITION_LIMIT,
-    _read_write(60, 1, "startup configuration", 0, 0, 3),
+    STARTUP,
     SHUTDOWN,
     TORQUE_ENABLE,
     LED,

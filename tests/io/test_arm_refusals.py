@@ -120,6 +120,12 @@ def test_old_firmware_of_a_330_is_refused_because_its_addresses_differ() -> None
         (reg.DRIVE_MODE, 1, "drive mode (register 10) is 1, expected 0, because the vehicle file's sign"),
         (reg.SECONDARY_ID, 11, "secondary id (register 12) is 11, expected 255, because it would follow another servo"),
         (reg.PWM_LIMIT, 300, "PWM limit (register 36) is 300, expected 885, because a lower limit gives less torque"),
+        (
+            reg.STARTUP,
+            1,
+            "startup configuration (register 60) is 1, expected 0, because after a restart it would switch",
+        ),
+        (reg.STARTUP, 2, "startup configuration (register 60) is 2, expected 0"),
         (reg.SHUTDOWN, 0x14, "shutdown (register 63) is 20, expected 52, because overheating, shock and overload"),
     ],
 )

@@ -77,6 +77,18 @@ def test_position_starts_within_one_turn_and_then_counts_turns() -> None:
     assert get(servo, 132, 4, signed=True) == start
 
 
+def test_the_startup_configuration_switches_the_torque_on() -> None:
+    servo = in_current_mode()
+    servo.write(64, b"\x00")
+    servo.write(60, b"\x01")
+    servo.reboot()
+    assert get(servo, 64, 1) == 1
+    servo.write(64, b"\x00")
+    servo.write(60, b"\x00")
+    servo.reboot()
+    assert get(servo, 64, 1) == 0
+
+
 def test_settings_of_the_world_are_in_their_registers() -> None:
     settings = {
         "firmware": 40,

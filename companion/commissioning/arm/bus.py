@@ -27,7 +27,6 @@ ID = Register(7, 1, "id")
 BAUD = Register(8, 1, "baud rate")
 MAX_POSITION_LIMIT = Register(48, 4, "max position limit")
 MIN_POSITION_LIMIT = Register(52, 4, "min position limit")
-STARTUP = Register(60, 1, "startup configuration")
 LED = Register(65, 1, "LED")
 
 PING_BYTES: Final = 14

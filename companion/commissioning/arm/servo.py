@@ -19,7 +19,7 @@ from companion.preflight.arm import mode_text
 
 SETTINGS: Final = (
     bus.ID, bus.BAUD, dxl.RETURN_DELAY, dxl.DRIVE_MODE, dxl.OPERATING_MODE, dxl.SECONDARY_ID, dxl.HOMING_OFFSET, dxl.PWM_LIMIT,
-    dxl.CURRENT_LIMIT, bus.MAX_POSITION_LIMIT, bus.MIN_POSITION_LIMIT, bus.STARTUP, dxl.SHUTDOWN, dxl.TORQUE_ENABLE,
+    dxl.CURRENT_LIMIT, bus.MAX_POSITION_LIMIT, bus.MIN_POSITION_LIMIT, dxl.STARTUP, dxl.SHUTDOWN, dxl.TORQUE_ENABLE,
     dxl.STATUS_RETURN_LEVEL, dxl.HARDWARE_ERROR, dxl.BUS_WATCHDOG, dxl.PRESENT_POSITION, dxl.PRESENT_VOLTAGE,
     dxl.PRESENT_TEMPERATURE,
 )  # fmt: skip
@@ -155,7 +155,6 @@ def settings(servo: FoundServo, index: int, arm: Arm, device: ArmDevice) -> list
         (dxl.CURRENT_LIMIT, wanted_limit, str, f"torque_max_nm {joint.torque_max_nm:g} needs {needed}"),
         (bus.MIN_POSITION_LIMIT, 0, str, "the companion itself enforces the joint limits"),
         (bus.MAX_POSITION_LIMIT, COUNTS_PER_TURN - 1, str, "the companion itself enforces the joint limits"),
-        (bus.STARTUP, 0, str, "no torque at power-on"),
         (bus.ID, joint.servo_id, str, "the vehicle file's servo_id"),
         (bus.BAUD, bus.BAUDS.index(device.baud), baud_text, "the vehicle file's devices.arm.baud"),
     ]  # fmt: skip

@@ -42,6 +42,7 @@ SECONDARY_ID = Register(12, 1, "secondary id")
 HOMING_OFFSET = Register(20, 4, "homing offset", signed=True)
 PWM_LIMIT = Register(36, 2, "PWM limit")
 CURRENT_LIMIT = Register(38, 2, "current limit")
+STARTUP = Register(60, 1, "startup configuration")
 SHUTDOWN = Register(63, 1, "shutdown")
 TORQUE_ENABLE = Register(64, 1, "torque enable")
 STATUS_RETURN_LEVEL = Register(68, 1, "status return level")
@@ -61,6 +62,7 @@ REQUIRED: Final = (
     (HOMING_OFFSET, 0, "the vehicle file's zero_count gives the zero"),
     (SECONDARY_ID, 255, "it would follow another servo's commands"),
     (PWM_LIMIT, 885, "a lower limit gives less torque at speed"),
+    (STARTUP, 0, "after a restart it would switch its torque on by itself, or bring back old settings"),
     (SHUTDOWN, 0b00110100, "overheating, shock and overload switch the torque off"),
 )
 """EEPROM settings, with their reason, that `companion arm setup` writes and every start of the arm verifies: other values change what
