@@ -116,6 +116,7 @@ class MachineWires:
             [servo.drive for servo in self.servos],
             vehicle.tether,
             self.servos,
+            self._jaws,
         )
         if config.faults:
             self.plant.inject(self.faults)

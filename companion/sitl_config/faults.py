@@ -143,6 +143,7 @@ KINDS: dict[str, Kind] = {
         default=30.0,
         named_by=("joint_jump", "joint_beyond_limit", "joint_far_beyond_limit", "joint_rate", "servo_overload"),
     ),
+    "clamp_overload": Kind("the clamp's servo reports overload and releases its torque", named_by=("clamp_error",)),
     "bus_noise": Kind(
         what="packets on the servo bus are corrupted",
         size="fraction of packets",
@@ -289,6 +290,8 @@ def absent_part(kind: FaultKind, vehicle: Vehicle) -> str | None:
         return "arm"
     if kind.startswith("payload_") and not vehicle.has_net:
         return "tool (a net)"
+    if kind.startswith("clamp_") and vehicle.jaws is None:
+        return "tool (a clamp)"
     if kind == "tool_broken" and (vehicle.tool is None or vehicle.has_net):
         return "tool (a rod or a brush)"
     return None

@@ -9,6 +9,7 @@ from companion.config.vehicle import Vehicle
 from companion.model.team import ClampCommand, ClampState
 from sitl.servo.drive import MODE_CURRENT_POSITION, RAD_PER_COUNT, ServoDrive
 from sitl.servo.from_config import jaws_servo_of
+from sitl.servo.model import ERROR_OVERLOAD
 
 
 class FastClamp:
@@ -21,6 +22,7 @@ class FastClamp:
     def __init__(self, jaws: Jaws, drive: ServoDrive) -> None:
         self._jaws, self.drive = jaws, drive
         self._command: ClampCommand | None = None
+        self._error: int | None = None
         drive.mode, drive.torque_on = MODE_CURRENT_POSITION, False
         drive.set_goal_current(round(jaws.current_a / drive.amp_per_count), at_once=True)
 
@@ -32,7 +34,11 @@ class FastClamp:
 
     def read(self, t_s: float) -> ClampState:
         """Return the state at this time."""
-        return ClampState(t_s, self.drive.present()[2] * RAD_PER_COUNT)
+        return ClampState(t_s, self.drive.present()[2] * RAD_PER_COUNT, self._error)
+
+    def trip_overload(self) -> None:
+        """Raise the overload error, which switches the torque off."""
+        self._error, self.drive.torque_on = ERROR_OVERLOAD, False
 
     def write(self, command: ClampCommand | None) -> None:
         """Carry out a command that is new."""
@@ -41,4 +47,4 @@ class FastClamp:
         self._command = command
         angle_deg = self._jaws.open_deg if command is ClampCommand.OPEN else self._jaws.empty_deg
         self.drive.goal_position_counts = round(math.radians(angle_deg) / RAD_PER_COUNT)
-        self.drive.torque_on = True
+        self.drive.torque_on = self._error is None

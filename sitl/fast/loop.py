@@ -85,7 +85,9 @@ class FastFlight:
         self._clamp = FastClamp.of(vehicle)
         jaws = None if self._clamp is None else self._clamp.drive
         self.plant = Plant(vehicle, world, self.px4, drives, pose, jaws=jaws, scene=scene, number=number)
-        self.faults = Faults(world, self.plant.scene, self.plant.machine, self.px4, drives, vehicle.tether)
+        self.faults = Faults(
+            world, self.plant.scene, self.plant.machine, self.px4, drives, vehicle.tether, clamp=self._clamp
+        )
         faults = self.faults if world.faults else None
         if faults is not None:
             self.plant.inject(faults)

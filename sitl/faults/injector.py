@@ -40,11 +40,15 @@ _OTHER_BODY_YAW_RAD = math.radians(120.0)
 _BESIDE = (0.6, 0.8)
 
 
-class Servo(Protocol):
-    """A servo behind its control table (`sitl.servo.model.ServoModel`)."""
+class ClampServo(Protocol):
+    """The clamp's servo, with or without its control table."""
 
     def trip_overload(self) -> None:
         """Raise the overload error."""
+
+
+class Servo(ClampServo, Protocol):
+    """A servo behind its control table (`sitl.servo.model.ServoModel`)."""
 
     def set_temperature_c(self, temperature_c: float) -> None:
         """Set the motor temperature."""
@@ -56,6 +60,7 @@ class Faults:
     Args:
         config: configuration of the world; every fault has a time (`with_fault_times`).
         servos: control tables of the servos; empty in the fast closed loop.
+        clamp: the clamp's servo; None without a clamp.
     """
 
     def __init__(
@@ -67,12 +72,13 @@ class Faults:
         drives: Sequence[ServoDrive],
         tether: Tether | None,
         servos: Sequence[Servo] = (),
+        clamp: ClampServo | None = None,
     ) -> None:
         self._faults = config.faults
         self._on = [False] * len(config.faults)
         self._begins_s: list[float | None] = [None] * len(config.faults)
         self._scene, self._machine = scene, machine
-        self._px4, self._drives, self._servos = px4, drives, servos
+        self._px4, self._drives, self._servos, self._clamp = px4, drives, servos, clamp
         self._tether = tether
         self._wind_m_s = machine.wind_m_s
         self._tether_m = machine.tether.length_m
@@ -176,6 +182,9 @@ class Faults:
                 self._contact.break_tool()
             case "servo_overload" if on:
                 self._shut_down_servo(fault.servo - 1, OVERLOAD)
+            case "clamp_overload" if on:
+                assert self._clamp is not None, "refused when the configuration is loaded"
+                self._clamp.trip_overload()
             case "servo_hot":
                 self._heat(fault.servo - 1, size if on else COOL_C)
             case "servo_angle":

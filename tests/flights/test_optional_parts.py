@@ -73,6 +73,7 @@ def test_without_all_three_the_path_is_flown_nothing_is_thrown_and_there_is_a_re
         ([NO_FORCE], "force_loss", "devices.force"),
         ([NO_TETHER], "tether_cut", "tether"),
         ([NO_TOOL, NO_FORCE], "payload_dropped", "tool"),
+        ([], "clamp_overload", "tool (a clamp)"),
     ],
 )
 def test_a_fault_of_an_absent_part_is_refused(absent: list[str], fault: str, key: str) -> None:

@@ -188,6 +188,17 @@ def test_a_member_that_px4_lands_blindly_is_not_waited_for_and_does_not_descend_
     assert_both_down_unharmed(team)
 
 
+def test_a_clamp_whose_servo_shuts_down_in_the_air_lands_both_and_the_bar_is_set_down() -> None:
+    team, result = flown("left.world.faults=[{kind: clamp_overload, t_s: 12.5}]")
+    left, right = result.members
+    assert ids(left)[2] == "clamp_error"
+    assert ids(right)[2:4] == ["partner_holds", "partner_lands"]
+    assert outcomes(result) == [Outcome.ABORTED, Outcome.ABORTED]
+    assert_both_down_unharmed(team)
+    assert team.scene.bar is not None
+    assert team.scene.bar.let_go_m == pytest.approx(0.0, abs=0.02)
+
+
 def test_a_bar_too_far_from_its_place_is_not_gripped_and_both_land_beside_it() -> None:
     team, result = flown("mission.phases[1].wait_max_s=1.5", "left.world.bar={pivot_offset_m: [0.3, 0.0, 0.0]}")
     assert [ids(member) for member in result.members] == 2 * [["takeoff", "not_gripped", "touchdown"]]

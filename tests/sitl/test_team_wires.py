@@ -12,8 +12,10 @@ from companion.model.team import ClampCommand
 from companion.model.types import IDENTITY_QUAT
 from companion.runtime.clock import flight_clock
 from companion.sitl_config.team import load_team
+from companion.sitl_config.world import World
 from sitl.mocap import MocapFrame
 from sitl.server import Sitl
+from sitl.servo.model import ERROR_OVERLOAD
 from sitl.wires import MachineWires, Ports
 from sitl.world.start import start_of
 from tests.support import DEADLINE_S, ROOT
@@ -21,11 +23,11 @@ from tests.support import DEADLINE_S, ROOT
 BAR = ((0.5, -0.25, 1.5), (0.6, 0.0, 0.0, 0.8))
 
 
-def machine() -> Sitl:
+def machine(world: World | None = None) -> Sitl:
     config = load_team(ROOT / "configs/teams/carry.yaml").members[0][1]
     start = config.mission.start
     at = start_of(start.position_m, start.yaw_deg, start.arm_deg)
-    return Sitl([MachineWires(config.vehicle, config.world, at, Ports(), lambda _: None)])
+    return Sitl([MachineWires(config.vehicle, world or config.world, at, Ports(), lambda _: None)])
 
 
 async def test_the_clamp_on_the_servo_bus_closes_and_opens_the_jaws_of_the_world() -> None:
@@ -47,6 +49,19 @@ async def test_the_clamp_on_the_servo_bus_closes_and_opens_the_jaws_of_the_world
 
             await asyncio.wait_for(moved(ClampCommand.CLOSE, vehicle.jaws.empty_deg), DEADLINE_S)
             await asyncio.wait_for(moved(ClampCommand.OPEN, vehicle.jaws.open_deg), DEADLINE_S)
+
+
+async def test_the_fault_of_the_clamp_is_a_hardware_error_on_the_servo_bus() -> None:
+    server = machine(World.model_validate({"faults": [{"kind": "clamp_overload", "after": "start", "t_s": 0.02}]}))
+    vehicle = server.machines[0].vehicle
+    async with server.wires() as (devices,):
+        device = ArmDevice(port=devices["arm"]["port"], baud=vehicle.arm_device.baud)
+        server._step()
+        async with DynamixelArm(device, vehicle.arm, flight_clock(), vehicle.jaws) as arm:
+            async with asyncio.timeout(DEADLINE_S):
+                while (state := arm.clamp()) is None or state.hardware_error != ERROR_OVERLOAD:
+                    server._step()
+                    await arm.read(1.0)
 
 
 async def test_the_bar_of_a_frame_is_streamed_with_the_id_of_the_vehicle_file() -> None:
