@@ -9,7 +9,6 @@ the operator, are in `companion.safety.rules`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Final
 
 from companion.config.safety import Safety
@@ -24,8 +23,6 @@ from companion.safety.stream_watch import StreamWatch
 FUSED_WITHIN_M: Final = 0.10
 FUSED_WITHIN_RAD: Final = math.radians(8.0)
 RATE_WINDOW_S: Final = 1.0
-SERVER_GROWTH: Final = 1e-4
-"""Largest drift of the server's clock, s/s: computers' clocks drift by less."""
 
 
 def unfused(i: Inputs) -> str | None:
@@ -89,7 +86,7 @@ class MocapTracker:
         """PX4's state whose IMU samples were used last."""
         self._imu_s = 0.0
         """End of the newest IMU sample on the flight clock."""
-        self._px4_clock, self._server_clock = RemoteClock(), RemoteClock(SERVER_GROWTH)
+        self._px4_clock = RemoteClock()
         self._against_imu = False
         """Whether the newest trusted pose disagrees with the IMU."""
         self._window_awake_s: float | None = None
@@ -174,7 +171,7 @@ class MocapTracker:
     def pose_filter(self) -> PoseFilter | None:
         """Return a filter for a landing without the core; None if the stream is rejected, so that no pose may be passed on."""
         rejected = self.frozen or self.two_streams or self.dragged
-        return None if rejected else PoseFilter(limits_of(self._s), self._filter.trusted)
+        return None if rejected else self._filter.after()
 
     def forwards(self, pose: MocapPose, vehicle: VehicleState | None, *, airborne: bool) -> bool:
         """Return whether a pose may be passed on to PX4, which need not wait for the next tick. Changes nothing.
@@ -182,7 +179,7 @@ class MocapTracker:
         In the air a repeated pose is withheld, long before `mocap_frozen`, because it suggests a vehicle at rest.
         """
         frame = self.frame
-        if not pose.tracking_valid or self._filter.exceeds(_latency_s(pose, self._server_clock.would_be_s)):
+        if not pose.tracking_valid or self._filter.exceeds(self._filter.latency_s(pose, learns=False)):
             return False
         if frame is None or pose.stamp_s == frame.stamp_s:  # the first, or one that a tick has evaluated
             return self.trusted and not (self.repeats and airborne)
@@ -221,7 +218,7 @@ class MocapTracker:
             self._trusted_awake_s = awake_s  # a stream may begin within a burst of lost frames
         gone_s = awake_s - self._frame_awake_s
         self.frame, self._frame_awake_s = pose, awake_s
-        self.latency_s = _latency_s(pose, self._server_clock.local_s)
+        self.latency_s = self._filter.latency_s(pose)
         self._window_frames += 1
         self._streams.update(pose.frame_number, (pose.position_world_m, pose.attitude_wxyz), awake_s)
         # The gap was reported as a loss; a rate across it does not describe this stream.
@@ -264,18 +261,6 @@ class MocapTracker:
         elif awake_s - start_s >= RATE_WINDOW_S:
             self.rate_hz = self._window_frames / (awake_s - start_s)
             self._window_awake_s, self._window_frames = awake_s, 0
-
-
-def _latency_s(pose: MocapPose, local_s: Callable[[float, float], float]) -> float | None:
-    """Return the time from the exposure of a pose to its arrival; None if it is unknown.
-
-    If the pose's latency ends at the transmission, the delay on the network beyond its smallest is added, by `local_s` of the
-    server's clock.
-    """
-    if pose.exposure_server_s is None:
-        return pose.latency_s
-    latency_s = pose.latency_s or 0.0
-    return latency_s + pose.stamp_s - local_s(pose.exposure_server_s + latency_s, pose.stamp_s)
 
 
 def mocap_lost(m: MocapTracker, timeout_s: float) -> Values | None:

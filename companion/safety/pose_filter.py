@@ -9,6 +9,7 @@ import math
 from typing import Final, NamedTuple
 
 from companion.model.types import MocapPose, Quat, Vec2, VehicleState
+from companion.safety.inertial_check import RemoteClock
 
 CONTINUOUS_S: Final = 0.1
 """After a longer gap a pose is compared with PX4's position, not with the previous pose."""
@@ -21,6 +22,8 @@ DRIFT_M_S: Final = 0.3
 BLIND_M_S15: Final = 0.2
 """Permitted error of PX4's position after a time t without a pose, divided by t^1.5: one standard deviation of a position integrated
 from an accelerometer with the noise that EKF2 assumes, 0.35 m/s2 (EKF2_ACC_NOISE), divided by sqrt(3)."""
+SERVER_GROWTH: Final = 1e-4
+"""Largest drift of the server's clock, s/s: computers' clocks drift by less."""
 
 
 class PoseLimits(NamedTuple):
@@ -42,13 +45,17 @@ class PoseFilter:
     Args:
         limits: limits of a pose.
         trusted: the newest trusted pose; None if there is none, so that the first pose is trusted.
+        server_clock: the server's clock as earlier poses have shown it; None if none has.
     """
 
-    def __init__(self, limits: PoseLimits, trusted: MocapPose | None = None) -> None:
+    def __init__(
+        self, limits: PoseLimits, trusted: MocapPose | None = None, server_clock: RemoteClock | None = None
+    ) -> None:
         self._limits = limits
         self._jump_cos_half = math.cos(0.5 * limits.jump_rad)
         self.trusted = self.tracked = trusted
         """The newest trusted pose, and the newest one in which the body was tracked."""
+        self._server_clock = server_clock or RemoteClock(SERVER_GROWTH)
         self._blind_s = 0.0
         """Longest time without a tracked body since the newest trusted pose. Poses that are rejected do not extend it, so that
         another body's pose is not trusted in the end."""
@@ -59,8 +66,12 @@ class PoseFilter:
         """
         if not pose.tracking_valid:
             return False
-        repeated = is_repeated(pose, self.tracked)
-        return self.evaluate(pose, vehicle) is None and not repeated and not self.is_too_late(pose)
+        repeated, too_late = is_repeated(pose, self.tracked), self.exceeds(self.latency_s(pose))
+        return self.evaluate(pose, vehicle) is None and not repeated and not too_late
+
+    def after(self) -> PoseFilter:
+        """Return a filter that knows what this one has seen."""
+        return PoseFilter(self._limits, self.trusted, self._server_clock)
 
     def evaluate(self, pose: MocapPose, vehicle: VehicleState | None, *, forgotten: bool = False) -> Vec2 | None:
         """Evaluate a new pose in which the body is tracked, and return its deviation; a reachable pose is trusted.
@@ -77,9 +88,20 @@ class PoseFilter:
             self.trusted = pose
         return off
 
-    def is_too_late(self, pose: MocapPose) -> bool:
-        """Return whether a pose is so old that it counts as lost."""
-        return self.exceeds(pose.latency_s)
+    def latency_s(self, pose: MocapPose, *, learns: bool = True) -> float | None:
+        """Return the time from the exposure of a pose to its arrival; None if it is unknown.
+
+        If the pose's latency ends at the transmission, the delay on the network beyond its smallest is added, by the server's clock.
+
+        Args:
+            pose: the pose.
+            learns: False changes nothing.
+        """
+        if pose.exposure_server_s is None:
+            return pose.latency_s
+        latency_s, clock = pose.latency_s or 0.0, self._server_clock
+        sent_s = (clock.local_s if learns else clock.would_be_s)(pose.exposure_server_s + latency_s, pose.stamp_s)
+        return latency_s + pose.stamp_s - sent_s
 
     def exceeds(self, latency_s: float | None) -> bool:
         """Return whether a latency is so large that a pose with it counts as lost."""

@@ -167,6 +167,17 @@ def test_a_pose_whose_measured_delay_is_too_large_is_not_passed_on(late_s: float
     assert evaluated is not None and monitors.forwards(evaluated, vehicle) is passes
 
 
+def test_a_landing_without_the_core_judges_the_delay_on_the_network_as_the_flight_does() -> None:
+    """The delay is there from the first pose of the landing on: only the flight has seen the server's clock without it."""
+    monitors = Monitors(VEHICLE)
+    watched(VEHICLE, [healthy(k) for k in range(100)], flying(), monitors)
+    landing = monitors.pose_filter()
+    first, second = healthy(100).mocap, healthy(101).mocap
+    assert landing is not None and first is not None and second is not None and first.exposure_server_s is not None
+    assert not landing.check(replace(first, exposure_server_s=first.exposure_server_s - 0.15), healthy(100).vehicle)
+    assert landing.check(second, healthy(101).vehicle)
+
+
 def test_bad_poses_of_every_kind_in_turn_are_no_motion_capture() -> None:
     """None of the kinds lasts; but nothing to believe has come."""
 
@@ -373,5 +384,9 @@ def test_a_repeated_an_untracked_or_a_late_pose_is_not_passed_on() -> None:
     first, second, third, fourth = (pose for pose in poses if pose is not None)
     assert checked.check(first, None) and not checked.check(replace(first, stamp_s=second.stamp_s), None)
     assert not checked.check(replace(third, tracking_valid=False), None)
-    assert not checked.check(replace(third, latency_s=VEHICLE.safety.mocap_latency_max_s + 0.01), None)
+    assert third.exposure_server_s is not None and third.latency_s is not None
+    late_s = VEHICLE.safety.mocap_latency_max_s + 0.01
+    exposed_s = third.exposure_server_s + third.latency_s - late_s
+    assert not checked.check(replace(third, latency_s=late_s, exposure_server_s=exposed_s), None)
+    assert not checked.check(replace(third, exposure_server_s=third.exposure_server_s - 0.15), None)
     assert checked.check(fourth, None)
