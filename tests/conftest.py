@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import gc
+import importlib
 import inspect
 import itertools
 import os
@@ -101,6 +103,23 @@ def _nothing_is_hoarded(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 _TESTS = Path(__file__).parent
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """Import all test files, each worker from another one on: on a fresh clone each compiles another part of what all of them import,
+    where otherwise each compiled everything. An import that fails is reported by the collection.
+    """
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if workers == 1 or session.config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
+        return
+    files = sorted(_TESTS.rglob("test_*.py"))
+    first = len(files) * int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw")) // workers
+    for path in files[first:] + files[:first]:
+        with contextlib.suppress(Exception, pytest.skip.Exception):
+            importlib.import_module(".".join(path.relative_to(_TESTS.parent).with_suffix("").parts))
+
+
 _LONG = ("project", "launcher", "flights", "sitl", "plugins", "gym", "core", "preflight", "commissioning", "recorder")
 """Folders whose files take longest, in the order in which they begin: whole flights, and the checks of all files."""
 
