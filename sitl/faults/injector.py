@@ -109,6 +109,7 @@ class Faults:
         origins = {
             "start": 0.0,
             "arming": armed_t_s,
+            "throw": payload.thrown_t_s,
             "catch": payload.caught_t_s,
             "touch": contact.touched_s if contact is not None else None,
             "press": contact.pressed_s if contact is not None else None,

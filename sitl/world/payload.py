@@ -228,7 +228,7 @@ class Payload:
         velocity = arrival - gravity * flight_s
         point = target - velocity * flight_s - 0.5 * gravity * flight_s**2
         if self._person is not None:
-            point = np.array(self._person.from_m)
+            point, target = np.array(self._person.from_m), target + np.array(self._person.aims_m)
             mean = (target - point) / flight_s
             # A person allows for the drag: for its displacement at the mean velocity.
             drag_s_1 = self._drag_n_s2_m2 * float(np.linalg.norm(mean)) / self._config.payload_kg

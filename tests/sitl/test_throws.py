@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import pytest
@@ -109,6 +110,21 @@ def test_the_miss_is_the_distance_from_the_nets_centre() -> None:
     _, payload = waited("world.faults=[{kind: payload_missed, t_s: 0, duration_s: 20, size: 0.2}]")
     assert payload.caught_t_s is None
     assert payload.miss_m == pytest.approx(0.2, abs=0.03)
+
+
+def test_a_person_may_aim_beside_the_net() -> None:
+    _, payload = waited(PERSON.replace("}]", ", aims_m: [0.1, -0.2, 0]}]"))
+    assert payload.caught_t_s is None
+    assert payload.miss_m == pytest.approx(math.hypot(0.1, 0.2), abs=0.05)
+
+
+def test_a_second_ball_may_be_thrown_a_while_after_the_first() -> None:
+    fault = "world.faults=[{kind: payload_double, after: throw, t_s: 0.1, size: 0.1}]"
+    result, payload = waited(fault, "vehicle.devices.mocap.ball={kind: marker}")
+    assert payload.thrown_t_s is not None
+    seen = [(i.markers.exposed_s - payload.thrown_t_s, len(i.markers.markers)) for i in result.inputs if i.markers]
+    assert {count for since_s, count in seen if 0.01 < since_s < 0.09} == {1}
+    assert {count for since_s, count in seen if 0.12 < since_s < 0.3} == {2}
 
 
 def test_a_throw_that_never_rises_to_the_net_has_its_smallest_distance_as_miss() -> None:

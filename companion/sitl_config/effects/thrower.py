@@ -13,6 +13,8 @@ class Person(Model):
     """Point at which the payload leaves the hand, world frame."""
     flight_s: Positive = 0.45
     """Time from the throw to the arrival at the net: a long flight is a lob."""
+    aims_m: Vector3 = (0.0, 0.0, 0.0)
+    """Point at which the person aims, from the net's centre: the rotors, for example."""
 
 
 class Thrower(Effect):
