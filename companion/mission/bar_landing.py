@@ -16,11 +16,15 @@ PRESS_M: Final = 0.01
 """Depth by which the clamp is led below the height at which the bar stands."""
 STAND_S: Final = 1.0
 """Time on the floor until the clamp opens: the other vehicle may have begun a little later."""
-OPENING_S: Final = 1.0
+OPENING_S: Final = 0.8
 BACK_M: Final = 0.6
-BACK_S: Final = 3.0
+BACK_S: Final = 2.2
 RISE_M: Final = 0.1
 RISE_S: Final = 1.0
+FOLD_AFTER_S: Final = 0.5
+"""Time from the beginning of the rise until the arm folds: the clamp is above the handle then."""
+FOLDED_S: Final = 0.5
+"""Time before the end of the fold, which then moves the arm by less than a tenth of its way, at which the descent may begin."""
 
 
 def landing_with_bar(
@@ -54,11 +58,14 @@ def landing_with_bar(
     begun_s = builder.t_s
     x, y, z = builder.position_m
     builder.go((x, y, z + RISE_M), RISE_S)
-    builder.t_s += RISE_S
+    builder.t_s += FOLD_AFTER_S
+    fold_s = fold_time_s(now.arm_rad, arm_fold_rad)
+    builder.fold_arm(arm_fold_rad, fold_s)
+    folded_s = builder.t_s + fold_s
+    builder.t_s = begun_s + RISE_S
     dx, dy, _ = quat_rotate(quat_from_euler_zyx(0.0, 0.0, now.yaw_rad), (-BACK_M, 0.0, 0.0))
     builder.go((x + dx, y + dy, z + RISE_M), BACK_S)
-    builder.fold_arm(arm_fold_rad, max(BACK_S, fold_time_s(now.arm_rad, arm_fold_rad)))
-    builder.t_s += max(BACK_S, fold_time_s(now.arm_rad, arm_fold_rad))
+    builder.t_s = max(builder.t_s + BACK_S, folded_s - FOLDED_S)
     _segment(builder, "leave the bar", begun_s)
     begun_s = builder.t_s
     builder.t_s = builder.descend(speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)

@@ -303,9 +303,9 @@ class Fault(Model):
     kind: FaultKind
     t_s: NonNegative | None = None
     """Time from the event in `after` to the start of the fault. If it is absent, `phase` determines the start."""
-    after: Literal["start", "arming", "throw", "catch", "touch", "press"] = "arming"
-    """Event from which `t_s` counts: the start of the world, arming, the first throw, the catch, the first touch of a surface, or the
-    beginning of the first one that lasts for 2.5 s."""
+    after: Literal["start", "arming", "throw", "catch", "touch", "press", "lift"] = "arming"
+    """Event from which `t_s` counts: the start of the world, arming, the first throw, the catch, the first touch of a surface, the
+    beginning of the first one that lasts for 2.5 s, or the lift of a bar that two vehicles carry."""
     phase: FlightPhase | None = None
     """Alternative to `t_s`: the fault starts in the middle of this part of the mission, or just after the catch. `touch`, `press`,
     `slide` and `detach` are parts of a contact with a surface."""

@@ -16,9 +16,8 @@ from companion.model.types import Outcome
 from companion.safety.tether import slack_m as slack_of
 from companion.safety.touchdown import HEIGHT_MARGIN_M
 from companion.sitl_config.loader import SitlConfig
-from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, with_world
+from sitl.campaigns.flights import Flown, fly_to_end, laboratory_of, outcome_of, with_world
 from sitl.campaigns.runner import Data
-from sitl.fast.result import FastResult
 from sitl.faults.timing import FaultError, with_fault_times
 from sitl.world.state import Snapshot
 
@@ -84,7 +83,7 @@ def record_of(flown: Flown) -> FaultFlight:
     low_m = fast.config.vehicle.airframe.ground_clearance_m + HEIGHT_MARGIN_M
     landed = bool(course) and course[-1].position_world_m[2] < low_m and not result.armed
     return FaultFlight(
-        outcome=_outcome(result).value,
+        outcome=outcome_of(result).value,
         begun_s=fast.faults.begun_s,
         course=course,
         ticks=ticks_of(result.outputs),
@@ -92,12 +91,3 @@ def record_of(flown: Flown) -> FaultFlight:
         landed=landed,
         caught=result.caught,
     )
-
-
-def _outcome(result: FastResult) -> Outcome:
-    if result.crashed:
-        return Outcome.CRASHED
-    if result.guardian_landed is not None:
-        return Outcome.ABORTED if result.guardian_landed else Outcome.LOST
-    ended = result.outputs[-1].outcome if result.outputs else None
-    return ended or Outcome.LOST

@@ -78,6 +78,16 @@ def fly_to_end(config: SitlConfig, until_mission_s: float = math.inf) -> Flown:
         return Flown(config, None, FastResult(), f"{type(error).__name__}: {error}")
 
 
+def outcome_of(result: FastResult) -> Outcome:
+    """Return the outcome of a flight; the guardian may have ended it."""
+    if result.crashed:
+        return Outcome.CRASHED
+    if result.guardian_landed is not None:
+        return Outcome.ABORTED if result.guardian_landed else Outcome.LOST
+    ended = result.outputs[-1].outcome if result.outputs else None
+    return ended or Outcome.LOST
+
+
 def mission_s(result: FastResult, t_s: float | None) -> float | None:
     """Convert a time from the flight clock to the mission clock, s; None if it is None or the mission has not begun."""
     begun_s = next((o.t_s - o.mission_t_s for o in result.outputs if o.mission_t_s > 0), None)

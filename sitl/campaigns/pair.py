@@ -10,14 +10,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from companion.mission.phase import phases_of
 from companion.model.types import Outcome, SafetyAction
+from companion.phases.carry.grip import GripHandle
+from companion.sitl_config.bar import Bar
 from companion.sitl_config.loader import SitlConfig
 from companion.sitl_config.team import SEED_APART, TeamConfig
-from sitl.campaigns.flights import laboratory_of, limit_s, with_world
+from sitl.campaigns.flights import laboratory_of, limit_s, outcome_of, with_world
 from sitl.campaigns.runner import Data
 from sitl.fast.result import FastResult
 from sitl.fast.team import FastTeam, TeamResult
 
+DOWN_M = 0.03
+"""Height of a vehicle above its place on the floor below which it is down."""
 _WORSE = (Outcome.COMPLETED, Outcome.REFUSED, Outcome.ABORTED, Outcome.LOST, Outcome.CRASHED)
 
 
@@ -38,11 +43,14 @@ def fly(config: SitlConfig, flight: Data) -> Data:
     """Fly one flight; return its row.
 
     The row has: name, number, world_seed, outcome (the worse of both), outcomes (left, right), why (the first event that ended the
-    mission), error (exception that ended the flight), the figures of the bar (`PairTruth.report`), events (left, right).
+    mission), error (exception that ended the flight), the figures of the bar (`PairTruth.report`), share_wanted (of the left vehicle:
+    that of a level bar at rest), dropped (whether the bar fell to the floor), rotors_touched (by the bar or by each other), down_s
+    (time from the beginning of the first fault until both stand on the floor; None without a fault, or if their rotors still turn at
+    the end), events (left, right).
     """
     left = with_world(config, {"seed": flight["seed"]})
     right = with_world(SitlConfig.model_validate_json(flight["right"]), {"seed": flight["seed"] + SEED_APART})
-    error, result = None, TeamResult()
+    error, result, team = None, TeamResult(), None
     report: Data = {}
     try:
         team = FastTeam(TeamConfig("", "", left, right))
@@ -51,6 +59,7 @@ def fly(config: SitlConfig, flight: Data) -> Data:
         report = result.truth.report()
     except Exception as failure:
         error = f"{type(failure).__name__}: {failure}"
+    happened = set() if team is None else {event.kind for event in team.scene.take_events()}
     found = [outcome_of(member) for member in result.members]
     return {
         "row": {
@@ -65,17 +74,36 @@ def fly(config: SitlConfig, flight: Data) -> Data:
                 key: report.get(key)
                 for key in ("bar_p_rms_m", "bar_tilt_rms_deg", "internal_force_rms_n", "share", "let_go")
             },
+            "share_wanted": _share_wanted(left),
+            "dropped": "bar_dropped" in happened,
+            "rotors_touched": bool(happened & {"rotor_hit", "rotors_touched"}),
+            "down_s": None if team is None else down_s(team, result),
             "events": [
-                [event.id for outputs in member.outputs for event in outputs.events] for member in result.members
+                [event.id for event in (*(e for o in member.outputs for e in o.events), *member.guardian_events)]
+                for member in result.members
             ],
         }
     }
 
 
-def outcome_of(result: FastResult) -> Outcome:
-    """Return the outcome of one member's flight."""
-    last = result.outputs[-1] if result.outputs else None
-    return Outcome.CRASHED if result.crashed else (last and last.outcome) or Outcome.LOST
+def _share_wanted(left: SitlConfig) -> float:
+    """Return the left vehicle's share of the weight of a level bar at rest, which its centre of mass determines."""
+    true = left.world.bar or Bar()
+    grip = next(phase for phase in phases_of(left.mission) if isinstance(phase, GripHandle))
+    return 0.5 + true.centre_offset_m / (grip.bar.length_m + true.length_error_m)
+
+
+def down_s(team: FastTeam, result: TeamResult) -> float | None:
+    """Return the time from the beginning of the first fault until both stand on the floor; None as in a row."""
+    begun_s = min((flight.faults.begun_s for flight in team.flights if flight.faults.begun_s is not None), default=None)
+    if begun_s is None or any(flight.px4.armed or flight.plant.machine.crashed for flight in team.flights):
+        return None
+    latest_s = begun_s
+    for flight, member in zip(team.flights, result.members, strict=True):
+        low_m = flight.config.vehicle.airframe.ground_clearance_m + DOWN_M
+        above_s = (state.t_s for state in (*member.snapshots, *member.after) if state.q[2] > low_m)
+        latest_s = max(latest_s, *above_s)
+    return round(latest_s - begun_s, 3)
 
 
 def _why(members: Sequence[FastResult]) -> str | None:

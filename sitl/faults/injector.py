@@ -105,7 +105,7 @@ class Faults:
     def step(self, t_s: float, armed_t_s: float | None) -> None:
         """Start and end faults that are due; call it before every step of the physics."""
         self._now_s = t_s
-        contact, payload = self._machine.contact, self._scene.payload
+        contact, payload, bar = self._machine.contact, self._scene.payload, self._scene.bar
         origins = {
             "start": 0.0,
             "arming": armed_t_s,
@@ -113,6 +113,7 @@ class Faults:
             "catch": payload.caught_t_s,
             "touch": contact.touched_s if contact is not None else None,
             "press": contact.pressed_s if contact is not None else None,
+            "lift": bar.lifted_s if bar is not None else None,
         }
         for index, fault in enumerate(self._faults):
             origin_s = origins[fault.after]

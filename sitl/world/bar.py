@@ -25,6 +25,8 @@ _FEET_ASIDE_M: Final = 0.12
 _RADIUS_M: Final = 0.015
 _DROPPED_M_S: Final = 1.0
 """Speed of impact on the floor of a bar that is dropped; it is set down with less."""
+_LIFTED_M: Final = 0.02
+"""Height of the bar above its stand from which it is lifted."""
 _POINTS: Final = 9
 """Number of points of the bar at which its distance from rotors is judged."""
 
@@ -98,7 +100,9 @@ class Bar:
         """Whether each machine's jaws are closed; set by the machine's plant."""
         self._were_closed = [False, False]
         self.let_go_m: float | None = None
-        """Largest height above its stand from which the bar has fallen or was let go; None before."""
+        """Largest height above its stand from which an end of the bar has fallen or was let go; None before."""
+        self.lifted_s: float | None = None
+        """World time at which both clamps had lifted the bar off its feet; None before."""
         self._stands_m = spec.planned.handle_height_m
         self._was_falling_m_s = 0.0
 
@@ -123,6 +127,8 @@ class Bar:
             elif self.gripped[number] and (not closed or self._slips(number)):
                 self._let_go(number, t_s)
             self._were_closed[number] = closed
+        if self.lifted_s is None and all(self.gripped) and float(self._at[2]) > self._stands_m + _LIFTED_M:
+            self.lifted_s = t_s
         speed_m_s = -float(self._velocity[2])
         if self._was_falling_m_s > _DROPPED_M_S and speed_m_s < 0.5 * self._was_falling_m_s:
             self._events.report(t_s, "bar_dropped")
@@ -132,8 +138,10 @@ class Bar:
 
     def is_near(self, number: int) -> bool:
         """Return whether a machine's handle is between its jaws."""
-        at = plus(vec3_of(self._at), mat_vec(mat3_of(self._axes), self._handles[number]))
-        return math.dist(at, vec3_of(self._tips[number])) <= self._true.capture_m
+        return math.dist(self._handle_world_m(number), vec3_of(self._tips[number])) <= self._true.capture_m
+
+    def _handle_world_m(self, number: int) -> Vec3:
+        return plus(vec3_of(self._at), mat_vec(mat3_of(self._axes), self._handles[number]))
 
     def _take(self, number: int, t_s: float) -> None:
         clamp, handle = self._clamps[number], self._handles[number]
@@ -146,7 +154,7 @@ class Bar:
     def _let_go(self, number: int, t_s: float) -> None:
         self._data.eq_active[self._clamps[number]] = 0
         self.gripped[number] = False
-        self.let_go_m = max(self.let_go_m or 0.0, float(self._at[2]) - self._stands_m)
+        self.let_go_m = max(self.let_go_m or 0.0, self._handle_world_m(number)[2] - self._stands_m)
         self._events.report(t_s, "bar_let_go")
 
     def _slips(self, number: int) -> bool:

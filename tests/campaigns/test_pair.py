@@ -6,6 +6,8 @@ import csv
 import json
 from pathlib import Path
 
+import pytest
+
 from tests.short_carry import SHORT_CARRY
 from tests.support import run_here
 
@@ -26,6 +28,9 @@ def test_a_team_is_flown_in_drawn_laboratories_and_its_rows_carry_the_figures_of
     assert 0.0 < row["internal_force_rms_n"] < 3.0
     assert 0.3 < row["share"] < 0.7
     assert abs(row["let_go"]) < 0.05
+    assert row["share_wanted"] == pytest.approx(0.562, abs=1e-3), "its centre of mass is 7.5 cm from the middle"
+    assert row["share"] == pytest.approx(row["share_wanted"], abs=0.06)
+    assert (row["dropped"], row["rotors_touched"], row["down_s"]) == (False, False, None)
     assert found["summary"]["bar_p_rms_m"]["p50"] == row["bar_p_rms_m"]
     (line,) = csv.DictReader((tmp_path / "draws.csv").read_text(encoding="utf-8").splitlines())
     assert line["left_events"].split()[:2] == ["takeoff", "gripped"]

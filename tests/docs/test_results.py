@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -122,3 +122,34 @@ def test_the_page_says_how_the_laboratory_differs_from_the_paper() -> None:
     assert made["published"].count("Flown by") == 2
     assert "| adaptive/paper | 0.2 kg | 0 % | 0.400 | 0.200 | -50 % | 6 of 6 | 0.03 |" in made["adaptation"]
     assert made.keys().isdisjoint(("model error", "extras")), "not flown: the page keeps its tables"
+
+
+def test_campaigns_of_a_team_are_compared_with_the_first_draw_by_draw(tmp_path: Path) -> None:
+    """The draws of the second one are in another order, one of its flights was not completed, and its draw 9 has no pair."""
+
+    def campaign(factor: float, numbers: Sequence[int], command: str) -> dict[str, Any]:
+        rows = [
+            {
+                "number": number, "outcome": "completed", "bar_p_rms_m": factor * (0.02 + 0.001 * number), "bar_tilt_rms_deg": 1.0,
+                "internal_force_rms_n": factor, "share": 0.5 if number else 0.56, "share_wanted": 0.5,
+            }
+            for number in numbers
+        ]  # fmt: skip
+        return {"rows": rows, "settings": {"command": command, "team": "carry"}, "versions": {"git": "0123456789ab"}}
+
+    shipped, stiff = (
+        campaign(1.0, range(8), "companion one"),
+        campaign(2.0, [7, 6, 5, 4, 3, 2, 1, 9, 0], "companion two"),
+    )
+    stiff["rows"][-1] |= {"outcome": "crashed", "bar_p_rms_m": None}
+    page, files = tmp_path / "page.md", {name: tmp_path / f"{name}.json" for name in ("shipped", "stiff")}
+    for file, results in zip(files.values(), (shipped, stiff), strict=True):
+        file.write_text(json.dumps(results), encoding="utf-8")
+    page.write_text("<!-- table: carry -->\nthe old one\n<!-- end: carry -->\n", encoding="utf-8")
+    assert robustness_doc.main([str(page), str(files["shipped"]), "--beside", "stiff", str(files["stiff"])]) == 0
+    _, _, _, first, second, *_ = page.read_text(encoding="utf-8").splitlines()
+    assert first == "| as shipped | 8: 8 completed | 23.5 / 26.6 | 1.00 / 1.00 | 1.00 / 1.00 | 7 of 8 |"
+    assert second == (
+        "| stiff | 9: 8 completed, 1 crashed | 49.0 / 56.6; 2.00 (2.00 to 2.00) | 1.00 / 1.00; 1.00 (1.00 to 1.00) "
+        "| 2.00 / 2.00; 2.00 (2.00 to 2.00) | 8 of 8 |"
+    )

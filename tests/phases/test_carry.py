@@ -11,6 +11,8 @@ from msgspec.structs import replace
 
 from companion.config.loader import load_flight
 from companion.control.arm_model import manipulator_of
+from companion.core.transition import Parameters
+from companion.mission.bar_landing import landing_with_bar
 from companion.mission.check import check_mission
 from companion.mission.plan import Plan
 from companion.model.algebra import plus
@@ -79,6 +81,34 @@ def test_velocity_and_acceleration_of_a_turning_end_are_those_of_its_path() -> N
             )
             assert now.velocity_world_m_s[axis] == pytest.approx((p[2] - p[0]) / (2 * STEP_S), abs=1e-5)
             assert now.acceleration_world_m_s2[axis] == pytest.approx((v[1] - v[0]) / (2 * STEP_S), abs=1e-3)
+
+
+@pytest.mark.parametrize("after_s", [1.5, 6.0, 13.0, 24.0])
+def test_a_landing_with_the_bar_is_over_within_ten_seconds_and_moves_the_arm_only_above_the_handle(
+    after_s: float,
+) -> None:
+    """Half a second of them is for noticing why."""
+    config, plan, begin_s, _ = both_plans()[0]
+    parameters, vehicle, stands_m = Parameters.of(config), config.vehicle, 0.2
+    now = plan.reference(begin_s + after_s)
+    landing, opens_s = landing_with_bar(
+        now,
+        now.velocity_world_m_s,
+        stands_m,
+        parameters.manipulator,
+        parameters.fold_rad,
+        vehicle.safety.land_speed_m_s,
+        vehicle,
+    )
+    course = [landing.reference(0.02 * n) for n in range(int(landing.duration_s / 0.02))]
+    assert clamp_m(config, landing.reference(opens_s))[2] == pytest.approx(stands_m, abs=0.02)
+    folds = next(r for r in course if r.arm_rad != now.arm_rad)
+    assert clamp_m(config, folds)[2] > stands_m + 0.03
+    down_s = 0.02 * sum(r.position_world_m[2] > vehicle.airframe.ground_clearance_m for r in course)
+    assert down_s < 9.5
+    last = course[round(down_s / 0.02)]
+    assert last.arm_rad == pytest.approx(parameters.fold_rad, abs=0.01)
+    assert math.dist(last.position_world_m[:2], landing.reference(opens_s).position_world_m[:2]) == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize("end", ["left", "right"])

@@ -13,6 +13,8 @@ from companion.model.team import Grip, TeamState
 from companion.model.types import AutopilotRequest, OperatorCommand, Outcome, SafetyAction
 from companion.model.verdict import Answer
 from companion.sitl_config.team import load_team
+from sitl.campaigns.flights import outcome_of
+from sitl.campaigns.pair import down_s
 from sitl.fast.result import FastResult
 from sitl.fast.team import FastTeam, TeamResult
 from tests.short_carry import SHORT_CARRY
@@ -154,10 +156,10 @@ def test_with_a_member_that_does_not_go_with_it_a_vehicle_arms_nothing(changed: 
 @functools.cache
 def retried() -> tuple[FastTeam, TeamResult]:
     """The bar's body is said to be 6 cm beside where it is; the first of the places that are searched is 4 cm ahead. A warning before
-    that, here of a full disk, stops nothing. Soon after the lift has begun the right one's process is killed.
+    that, here of a full disk, stops nothing. Soon after the bar has left its feet the right one's process is killed.
     """
     disk_full = "left.world.faults=[{kind: disk_full, t_s: 3.0}]"
-    killed = "right.world.faults=[{kind: kill_flight, t_s: 15.0}]"
+    killed = "right.world.faults=[{kind: kill_flight, after: lift, t_s: 0.2}]"
     return flown("left.world.bar={pivot_offset_m: [0.06, 0.0, 0.0]}", disk_full, killed)
 
 
@@ -172,8 +174,15 @@ def test_a_member_whose_process_is_killed_brings_both_down() -> None:
     left, right = result.members
     assert right.guardian_landed
     assert {"partner_lands", "bar_let_go"} <= set(ids(left))
-    assert left.outputs[-1].outcome is Outcome.ABORTED
+    assert left.outputs[-1].outcome is outcome_of(right) is Outcome.ABORTED
     assert_both_down_unharmed(team)
+    assert team.scene.bar is not None
+    assert team.scene.bar.lifted_s is not None
+    assert team.flights[1].faults.begun_s == pytest.approx(team.scene.bar.lifted_s + 0.2, abs=0.005)
+    (touchdown_s,) = [event.t_s for outputs in left.outputs for event in outputs.events if event.id == "touchdown"]
+    disk_full_s = team.flights[0].faults.begun_s
+    assert disk_full_s is not None
+    assert down_s(team, result) == pytest.approx(touchdown_s - disk_full_s, abs=1.0)
 
 
 def test_a_member_that_px4_lands_blindly_is_not_waited_for_and_does_not_descend_into_its_handle() -> None:
