@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import datetime
+import importlib
 import json
 import os
 import platform
@@ -34,6 +35,7 @@ from benchmarks.measuring.figures import problems
 from benchmarks.measuring.page import markdown, show
 from benchmarks.measuring.rows import sections
 from companion.recorder.versions import versions
+from companion.runtime.files import write_whole
 from tools.compiled import BUILD
 
 ROOT = Path(__file__).parents[1]
@@ -52,50 +54,15 @@ Say = Callable[[str], None]
 # --- in the process of a part -------------------------------------------------------------------------------------------------------
 
 
-def _core(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
-    from benchmarks.measuring.core import REPEATS, measure
-
-    return measure(say, 2 if quick else REPEATS)
-
-
-def _compiled(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
-    from benchmarks.measuring.core import REPEATS, measure_compiled
-
-    return measure_compiled(say, 2 if quick else REPEATS)
-
-
-def _pi(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
-    from benchmarks.measuring.pi import measure
-
-    return measure(say)
-
-
-def _joints(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
-    from benchmarks.measuring.bus import bare_dynamixel, bare_dynamixel_in_world
-    from benchmarks.measuring.hovering import MISSION
-    from benchmarks.measuring.latency import WARM_UP
-
-    cycles = (QUICK_SAMPLES if quick else SAMPLES) + WARM_UP
-    say("bare dynamixel-sdk, a bus of its own")
-    alone = bare_dynamixel(cycles)
-    say("bare dynamixel-sdk, the world's bus")
-    in_world = bare_dynamixel_in_world(cycles, MISSION, folder)
-    return {"alone": {**asdict(alone), "wire_ms": alone.wire_ms}, "in_world": asdict(in_world)}
-
-
-def _setpoint(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
-    from benchmarks.measuring.setpoint import measure
-
-    return measure(QUICK_SAMPLES if quick else SAMPLES, say)
-
-
-def _hover(folder: Path, quick: bool, say: Say) -> dict[str, Any]:
-    from benchmarks.measuring.hover import HOVER_S, QUICK_HOVER_S, measure
-
-    return measure(folder, QUICK_HOVER_S if quick else HOVER_S, say)
-
-
-PARTS = {"core": _core, "compiled": _compiled, "pi": _pi, "joints": _joints, "setpoint": _setpoint, "hover": _hover}
+PARTS: dict[str, tuple[str, Callable[[Any, Path, bool, Say], dict[str, Any]]]] = {
+    "core": ("core", lambda part, folder, quick, say: part.measure(say, 2 if quick else part.REPEATS)),
+    "compiled": ("core", lambda part, folder, quick, say: part.measure_compiled(say, 2 if quick else part.REPEATS)),
+    "pi": ("pi", lambda part, folder, quick, say: part.measure(say)),
+    "joints": ("bus", lambda part, folder, quick, say: part.measure(folder, QUICK_SAMPLES if quick else SAMPLES, say)),
+    "setpoint": ("setpoint", lambda part, folder, quick, say: part.measure(QUICK_SAMPLES if quick else SAMPLES, say)),
+    "hover": ("hover", lambda part, folder, quick, say: part.measure(folder, part.QUICK_HOVER_S if quick else part.HOVER_S, say)),
+}  # fmt: skip
+"""The module of each part in `benchmarks.measuring`, and how it measures."""
 
 
 def run_part(name: str, folder: Path, quick: bool) -> int:
@@ -105,13 +72,14 @@ def run_part(name: str, folder: Path, quick: bool) -> int:
         print(f"  {name}: {text}", flush=True)
 
     try:
-        figures = PARTS[name](folder, quick, say)
+        module, measure = PARTS[name]
+        figures = measure(importlib.import_module(f"benchmarks.measuring.{module}"), folder, quick, say)
     except KeyboardInterrupt:
         return 130
     except Exception as error:  # any error is one line on the page, and the other parts continue
         print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)
         return 1
-    _write(folder / "figures.json", json.dumps(figures, indent=1) + "\n")
+    write_whole(folder / "figures.json", (json.dumps(figures, indent=1) + "\n").encode())
     return 0
 
 
@@ -194,8 +162,8 @@ def write_results(results: Mapping[str, Any], out: Path) -> None:
         for table in tables
         for row in table.rows
     ]
-    _write(out / "results.json", json.dumps({**results, "rows": rows}, indent=1) + "\n")
-    _write(out / "results.md", markdown(results, tables))
+    write_whole(out / "results.json", (json.dumps({**results, "rows": rows}, indent=1) + "\n").encode())
+    write_whole(out / "results.md", markdown(results, tables).encode())
 
 
 def tables_of(results: Mapping[str, Any]) -> Sequence[Any]:
@@ -204,12 +172,6 @@ def tables_of(results: Mapping[str, Any]) -> Sequence[Any]:
     return sections(
         {name: {"not_measured": part["failed"]} if part["failed"] else part["figures"] for name, part in parts.items()}
     )
-
-
-def _write(path: Path, text: str) -> None:
-    scratch = path.with_suffix(".new")
-    scratch.write_text(text, encoding="utf-8")
-    scratch.replace(path)
 
 
 def about() -> dict[str, Any]:
@@ -252,7 +214,7 @@ def main(argv: list[str] | None = None) -> int:
     if options.page:
         if not results["parts"]:
             parser.exit(2, f"benchmarks: {options.out} holds no results; run python -m benchmarks first\n")
-        _write(PAGE, markdown(results, tables_of(results)))
+        write_whole(PAGE, markdown(results, tables_of(results)).encode())
         print(PAGE)
         return 0
     signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import multiprocessing
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from benchmarks.measuring.far_end import prepare_far_end
+from benchmarks.measuring.hovering import MISSION
 from benchmarks.measuring.latency import DEADLINE_S, RATE_HZ, WARM_UP, Latency
 from companion.launcher.sitl_process import SitlProcess
 from companion.runtime.event_loop import run
@@ -61,6 +62,15 @@ class BusCycles:
     def wire_ms(self) -> float:
         """Shortest time of one cycle on the wire, with 10 bits per byte."""
         return 1e4 * (self.request_bytes + self.answer_bytes + self.write_bytes) / self.baud_bps
+
+
+def measure(folder: Path, samples: int, say: Callable[[str], None]) -> dict[str, Any]:
+    """Measure on a bus of its own, then on the world's; the folder is for the world's files."""
+    say("bare dynamixel-sdk, a bus of its own")
+    alone = bare_dynamixel(samples + WARM_UP)
+    say("bare dynamixel-sdk, the world's bus")
+    in_world = bare_dynamixel_in_world(samples + WARM_UP, MISSION, folder)
+    return {"alone": {**asdict(alone), "wire_ms": alone.wire_ms}, "in_world": asdict(in_world)}
 
 
 def bare_dynamixel(cycles: int) -> BusCycles:
