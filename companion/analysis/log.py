@@ -22,6 +22,7 @@ from pydantic import ValidationError
 from zstandard import ZstdError
 
 from companion import DISTRIBUTION
+from companion.analysis.flat import flat
 from companion.analysis.logged_config import checked_config, checked_path
 from companion.analysis.timing import Stopwatch, Timing, plausible, timing_of
 from companion.config.loader import FlightConfig, logged_flight
@@ -281,24 +282,11 @@ def array_of(values: Sequence[Any], width: int | None = None) -> Array:
 
 def _cells(record: Any) -> dict[str, Any]:
     """Return the values of a record and of the records in it, except `t_s` and `events`, keyed by column name."""
-    cells: dict[str, Any] = {}
-
-    def take(name: str, value: Any) -> None:
-        if isinstance(value, dict):
-            for key, part in value.items():
-                take(f"{name}.{key}", part)
-        elif isinstance(value, list | tuple) and all(isinstance(part, str) for part in value):
-            cells[name] = ", ".join(value)
-        elif isinstance(value, list | tuple):
-            for index, part in enumerate(value):
-                take(f"{name}[{index}]", part)
-        else:
-            cells[name] = value
-
-    for key, value in msgspec.to_builtins(record).items():
-        if key not in ("t_s", "events"):
-            take(key, value)
-    return cells
+    fields = {key: value for key, value in msgspec.to_builtins(record).items() if key not in ("t_s", "events")}
+    cells = flat(fields, lambda values: not all(isinstance(value, str) for value in values))
+    return {
+        name: ", ".join(value) if isinstance(value, list | tuple) else value for name, value in cells if value != {}
+    }
 
 
 class _Rows:

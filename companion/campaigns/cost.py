@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from companion.campaigns.runner import Row, flat
+from companion.analysis.flat import flat
+from companion.campaigns.runner import Row
 from companion.model.types import Outcome
 
 

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from companion import DISTRIBUTION
+from companion.analysis.flat import flat
 from companion.analysis.page import Page, Picture, Section, write_page
 from companion.campaigns.process import CampaignError, CampaignProcess, Message
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
@@ -279,15 +280,6 @@ def catches(rows: Iterable[Row]) -> tuple[int, int]:
 def catches_text(rows: Iterable[Row]) -> str:
     """Return the numbers of `catches` as a cell of a table: `1, 0`."""
     return "{}, {}".format(*catches(rows))
-
-
-def flat(row: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested mappings under their keys joined by dots."""
-    for key, value in row.items():
-        if isinstance(value, dict):
-            yield from ((f"{key}.{below}", found) for below, found in flat(value))
-        else:
-            yield key, value
 
 
 def to_json(data: Any) -> str:

@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
+from companion.analysis.flat import flat
 from companion.campaigns.process import CampaignError
 from companion.campaigns.robustness.cases import read_cases
-from companion.campaigns.runner import flat
 from companion.config.controller import preset_file
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_LOST, EXIT_OK
 from tests.campaigns.made_up import compare_row, draw_row, fault_row, fly_made_up

@@ -16,10 +16,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from companion.analysis.flat import flat
 from companion.campaigns.compare.grid import ABLATED, ADAPTATION_OFF, is_ablation
 from companion.campaigns.compare.paper_results import PrintedFlight, printed
 from companion.campaigns.cost import cost_of, flight_cost
-from companion.campaigns.runner import Row, catches, flat
+from companion.campaigns.runner import Row, catches
 
 COMPLETED = "completed"
 REFERENCE = "/".join(ABLATED)

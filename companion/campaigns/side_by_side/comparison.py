@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal
 
+from companion.analysis.flat import flat
 from companion.analysis.summary import world_text
-from companion.campaigns.runner import flat
 from companion.campaigns.side_by_side.flight import Flight
 from companion.campaigns.side_by_side.settings import Setting, fairness, payload_kg, settings_of, simulated
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from companion.analysis.flat import flat
 from companion.campaigns.side_by_side.flight import Flight
 
 _ADDRESSES = frozenset(
@@ -67,17 +68,17 @@ def settings_of(configs: Sequence[dict[str, Any]]) -> tuple[list[Setting], list[
     The section `world` of a flight on hardware is meaningless and left out.
     """
     in_world = [simulated(config) for config in configs]
-    flat = [
-        _flat(config if simulation else {name: part for name, part in config.items() if name != "world"})
+    named = [
+        {key: value for key, value in flat(config, _of_sections) if simulation or not key.startswith("world")}
         for config, simulation in zip(configs, in_world, strict=True)
     ]
-    keys = list(dict.fromkeys(key for one in flat for key in one))
+    keys = list(dict.fromkeys(key for one in named for key in one))
     settings: list[Setting] = []
     addresses: list[Setting] = []
     # Sections keep their order; a key that only a later flight has is appended to its section.
     for key in sorted(keys, key=lambda key: _rank(key.partition(".")[0])):
-        present = tuple(key in one for one in flat)
-        values = tuple(one.get(key) for one in flat)
+        present = tuple(key in one for one in named)
+        values = tuple(one.get(key) for one in named)
         if key.startswith(_NOT_SETTINGS) or (all(present) and all(_same(value, values[0]) for value in values)):
             continue
         if not any(values) and any(other.startswith((f"{key}.", f"{key}[")) for other in keys):
@@ -205,17 +206,11 @@ def _rank(section: str) -> int:
     return _SECTIONS.index(section) if section in _SECTIONS else len(_SECTIONS)
 
 
+def _of_sections(values: Sequence[Any]) -> bool:
+    """Return whether a list holds sections, as that of the phases; a list of plain values is one value."""
+    return any(isinstance(value, dict) for value in values)
+
+
 def _part(tree: dict[str, Any], name: str) -> dict[str, Any]:
     part = tree.get(name)
     return part if isinstance(part, dict) else {}
-
-
-def _flat(tree: Any, prefix: str = "") -> dict[str, Any]:
-    """Return the values of nested data by dotted key; a list of plain values counts as one value."""
-    if isinstance(tree, dict) and tree:
-        parts = [(f"{prefix}.{key}" if prefix else key, value) for key, value in tree.items()]
-    elif isinstance(tree, list) and any(isinstance(value, dict) for value in tree):
-        parts = [(f"{prefix}[{n}]", value) for n, value in enumerate(tree)]
-    else:
-        return {prefix: tree}
-    return {key: value for name, part in parts for key, value in _flat(part, name).items()}
