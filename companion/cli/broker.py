@@ -13,7 +13,7 @@ from companion import DISTRIBUTION
 from companion.config.document import ConfigError
 from companion.ground.protocol.keys import user_name
 from companion.ground.protocol.messages import Topic
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import print_error
 
 if TYPE_CHECKING:
@@ -81,16 +81,14 @@ def _init(arguments: argparse.Namespace) -> int:
         print_error(f"companion broker init: certificates need cryptography: pip install '{DISTRIBUTION}[ground]'")
         return EXIT_REFUSED
     if not arguments.folder.strip():
-        print_error("companion broker init: DIR: expected the name of a folder, got an empty name")
-        return EXIT_BAD_INPUT
+        raise ConfigError("companion broker init: DIR: expected the name of a folder, got an empty name")
     folder = Path(arguments.folder).absolute()
     now = datetime.datetime.now(datetime.UTC)
     if arguments.renew_certificates:
         if arguments.operator or arguments.viewer or arguments.vehicle:
-            print_error(
+            raise ConfigError(
                 "companion broker init: --renew-certificates creates no users: remove --operator, --viewer and --vehicle"
             )
-            return EXIT_BAD_INPUT
         hosts = broker_setup.renew_certificate(folder, arguments.host, arguments.days, now)
         print(
             f"{folder}/server.pem, server.key: for {', '.join(hosts)}, until {broker_setup.certificate_expiry(folder)}"

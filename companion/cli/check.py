@@ -21,6 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from companion.cli.campaign import wide_console
+from companion.config.document import ConfigError
 from companion.config.left_out import figures_left_out
 from companion.config.loader import FlightConfig
 from companion.config.vehicle import Vehicle
@@ -33,7 +34,7 @@ from companion.launcher.sitl_process import SitlProcess
 from companion.mission.check import check_mission
 from companion.mission.plan import Plan
 from companion.model.check_row import Level, Row, refusals
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.model.launcher_messages import WorldMessage, WorldProgress
 from companion.model.observations import Observations
 from companion.plugins import CONTROL_LAWS, find
@@ -94,10 +95,8 @@ def run(arguments: argparse.Namespace, config: SitlConfig, world: SitlProcess | 
 
 
 def _plan_only(arguments: argparse.Namespace, config: FlightConfig, found: list[str]) -> int:
-    for line in found:
-        print_error(line)
     if found:
-        return EXIT_BAD_INPUT
+        raise ConfigError(found)
     print(f"{arguments.mission}: mission {config.mission.name!r} can be flown by {config.vehicle.name}")
     for line in _poses(config.vehicle):
         print(f"  {line}")

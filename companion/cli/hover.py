@@ -10,8 +10,8 @@ from typing import Any
 
 from companion.analysis.hover_fit import SLOPE_MIN_V, HoverFit, HoverFitError, fit_hover_thrust
 from companion.analysis.log import FlightLog, LogError
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from companion.runtime.console import print_error
+from companion.config.document import ConfigError
+from companion.model.exit_codes import EXIT_OK
 
 _DIGITS = 4
 """Decimal places of a printed or written hover thrust: 0.01 % of full thrust."""
@@ -35,8 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
         log = FlightLog.read(arguments.log)
         fit = fit_hover_thrust(log)
     except (LogError, HoverFitError) as error:
-        print_error(error)
-        return EXIT_BAD_INPUT
+        raise ConfigError(str(error)) from None
     if arguments.json:
         print(json.dumps(jsonable(fit), indent=2, allow_nan=False))
     else:

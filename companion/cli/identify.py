@@ -11,8 +11,7 @@ from companion.analysis.log import FlightLog, LogError
 from companion.config.document import ConfigError
 from companion.config.shipped import FILES, named_file
 from companion.config.yaml_strict import read_document
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from companion.runtime.console import print_error
+from companion.model.exit_codes import EXIT_OK
 
 WORLD, RESULT = "identified_world.yaml", "identified.json"
 """Names of the files that the command writes."""
@@ -52,8 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         found = identify(FlightLog.read(arguments.log))
     except LogError as error:
-        print_error(error)
-        return EXIT_BAD_INPUT
+        raise ConfigError(str(error)) from None
     vehicle_file = _vehicle_file(arguments, found.flight.vehicle_file)
     changes = vehicle_changes(found)
     left_to_px4 = None

@@ -21,7 +21,7 @@ from companion.install.apply import Changes
 from companion.install.plan import Plan, Settings, isolation, plan
 from companion.install.record import RECORD_PATH, load, under_root
 from companion.install.state import InstallError
-from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_ABORTED, EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import print_error
 from companion.runtime.subprocesses import signals_call
 
@@ -86,11 +86,9 @@ def add_parser(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     root = Path(os.path.abspath(arguments.root))
     if not root.is_dir():
-        print_error(f"companion install: --root {arguments.root}: expected the root folder of a system")
-        return EXIT_BAD_INPUT
+        raise ConfigError(f"companion install: --root {arguments.root}: expected the root folder of a system")
     if arguments.json and not (arguments.yes or arguments.dry_run):
-        print_error("companion install: --json cannot ask for confirmation: add --yes or --dry-run")
-        return EXIT_BAD_INPUT
+        raise ConfigError("companion install: --json cannot ask for confirmation: add --yes or --dry-run")
     if root == Path("/") and os.geteuid() != 0 and not arguments.dry_run:
         print_error(
             f"companion install: needs root: sudo {os.path.abspath(sys.argv[0])} install ...; only --dry-run works without root"

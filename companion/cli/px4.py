@@ -16,7 +16,7 @@ from companion.config.loader import load_vehicle
 from companion.config.shipped import DEFAULT_VEHICLE
 from companion.io.protocols import DeviceError
 from companion.io.px4.transfer import Comparison, Difference, WriteResult, compare, write
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.model.link_address import parse_address
 from companion.px4 import params_file
 from companion.px4.params_file import PACKAGED, VEHICLE_ID, ParamsFile, skipped_lines, value_text
@@ -106,10 +106,7 @@ async def _run(arguments: argparse.Namespace, file: ParamsFile, device: Autopilo
             )
             return EXIT_REFUSED
         backup = arguments.backup or Path(f"px4_{time_stamp()}.params")
-        problem = _back_up(backup, comparison.differences, await autopilot.firmware(), path.name, system)
-        if problem is not None:
-            print_error(problem)
-            return EXIT_BAD_INPUT
+        _back_up(backup, comparison.differences, await autopilot.firmware(), path.name, system)
         result = await write(autopilot, comparison.differences)
     _print(arguments, comparison, result, backup)
     return EXIT_OK if result.problem is None and not comparison.absent else EXIT_REFUSED
@@ -122,8 +119,8 @@ async def _armed(autopilot: MavsdkAutopilot) -> bool:
     return status.armed
 
 
-def _back_up(path: Path, differences: Sequence[Difference], firmware: str, source: str, system: int) -> str | None:
-    """Save the old values; return why nothing may be written, or None if they are saved."""
+def _back_up(path: Path, differences: Sequence[Difference], firmware: str, source: str, system: int) -> None:
+    """Save the old values; raises ConfigError if they cannot be saved, so that nothing may be written."""
     heading = [f"Values, before writing, of the parameters that {source} changes, read from {firmware}.", ""]
     values = {difference.name: difference.px4 for difference in differences}
     text = params_file.text(values, heading, vehicle_id=system)
@@ -131,10 +128,11 @@ def _back_up(path: Path, differences: Sequence[Difference], firmware: str, sourc
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        return f"--backup {path}: already exists; choose another name (nothing was written)"
+        raise ConfigError(f"--backup {path}: already exists; choose another name (nothing was written)") from None
     except OSError as error:
-        return f"--backup {path}: {error.strerror or error}; choose a writable path (nothing was written)"
-    return None
+        raise ConfigError(
+            f"--backup {path}: {error.strerror or error}; choose a writable path (nothing was written)"
+        ) from None
 
 
 def _print(

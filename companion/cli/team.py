@@ -13,7 +13,7 @@ from companion.cli.options import add_law, add_overrides, add_seed, add_sitl, ad
 from companion.config.document import ConfigError
 from companion.config.shipped import names
 from companion.mission.check import check_mission
-from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+from companion.model.exit_codes import EXIT_OK, EXIT_REFUSED
 from companion.runtime.console import print_error, terminal_console
 from companion.runtime.subprocesses import LaunchError
 from companion.sitl_config.team import TEAM_WORLD, TeamConfig, load_team
@@ -77,10 +77,9 @@ def _fly(arguments: argparse.Namespace) -> int:
     from companion.launcher.team import run_team
 
     if arguments.sitl is None:
-        print_error(
+        raise ConfigError(
             "companion team fly: expected --sitl; on hardware each vehicle flies its part: companion fly FILE --member left"
         )
-        return EXIT_BAD_INPUT
     speed = speed_of(arguments)
     team = _loaded(arguments)
     problems = [
