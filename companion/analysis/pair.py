@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import Any
 
@@ -58,6 +58,22 @@ def bar_errors(at: Vec3, attitude: Quat, pulls_world_n: Sequence[Vec3], planned_
         for sign, pull in zip((1, -1), pulls_world_n, strict=True)
     )
     return math.dist(at, planned_m), math.asin(max(-1.0, min(1.0, along[2]))), internal_n
+
+
+FIGURES = {
+    "bar_p_rms_m": ("bar, position error", "mm RMS", 1e3),
+    "bar_tilt_rms_deg": ("bar, tilt", "deg RMS", 1.0),
+    "internal_force_rms_n": ("force that stretches the bar", "N RMS", 1.0),
+    "share": ("left vehicle's share", "of the weight", 1.0),
+    "let_go": ("let go", "m above its stand", 1.0),
+}
+"""Names, units and scales in which the figures of `summary.json` are shown."""
+
+
+def figure_texts(team: Mapping[str, float | None]) -> list[tuple[str, str]]:
+    """Return the name and the text of each figure."""
+    shown = [(name, team[key], unit, scale) for key, (name, unit, scale) in FIGURES.items()]
+    return [(name, "–" if value is None else f"{scale * value:.2f} {unit}") for name, value, unit, scale in shown]
 
 
 class PairFigures:

@@ -24,7 +24,7 @@ from companion.analysis.animation import (
 )
 from companion.analysis.log import Array, FlightLog
 from companion.analysis.page import Page, Section, write_page
-from companion.analysis.pair import BarSample, BarTruth, Course, bar_errors, carried
+from companion.analysis.pair import BarSample, BarTruth, Course, bar_errors, carried, figure_texts
 from companion.analysis.plot_style import SERIES, SOFT, dress, new_figure, write_pictures
 from companion.analysis.scene import FRAME, Camera, Scene, Shape
 from companion.analysis.table import Table, pairs
@@ -35,13 +35,6 @@ from companion.model.logged_geometry import logged_bar_length_m
 _SHOWN_S = 16.0
 """Duration of the animation at most; a longer flight is shown faster."""
 _BAR_RADIUS_M = 0.012
-_FIGURES = (
-    ("bar, position error, RMS", "bar_p_rms_m", " m", 3),
-    ("bar, tilt, RMS", "bar_tilt_rms_deg", " deg", 2),
-    ("force that stretches the bar, RMS", "internal_force_rms_n", " N", 2),
-    ("the left vehicle's share of the weight", "share", "", 2),
-    ("let go above its stand", "let_go", " m", 3),
-)
 
 
 def write_pair_report(
@@ -60,12 +53,12 @@ def write_pair_report(
     figure = None if not samples else _bar_figure(t_s, errors, [sample for sample, _ in samples])
     caption = "True state of the bar while both vehicles carry it, by the left vehicle's mission time."
     movie = _movie(truth, sides, t_s, errors)
-    team, members = summary["team"], summary["members"]
+    members = summary["members"]
     page = Page(
         summary["name"],
         "two vehicles and a bar",
         [
-            Section("", cards=[_figures(team), _members(members)]),
+            Section("", cards=[pairs("The bar", figure_texts(summary["team"])), _members(members)]),
             Section("Plots", pictures=write_pictures([("bar", "The bar", caption, figure)], out)),
         ],
         badge=str(summary["outcome"]),
@@ -77,14 +70,6 @@ def write_pair_report(
     path = out / "report.html"
     write_page(page, path)
     return path
-
-
-def _figures(team: Mapping[str, float | None]) -> Table:
-    rows = []
-    for text, key, unit, digits in _FIGURES:
-        value = team[key]
-        rows.append((text, "–" if value is None else f"{value:.{digits}f}{unit}"))
-    return pairs("The bar", rows)
 
 
 def _members(members: Mapping[str, Mapping[str, Any]]) -> Table:

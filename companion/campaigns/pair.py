@@ -6,35 +6,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 
 from companion.analysis.page import Page, Picture, Section
+from companion.analysis.pair import FIGURES
 from companion.analysis.table import Column, Table, for_terminal, number, table
 from companion.campaigns.process import Message
-from companion.campaigns.robustness.draws import SAFE
-from companion.campaigns.runner import Campaign, Row, counted, outcomes
+from companion.campaigns.robustness.campaign import Drawn
+from companion.campaigns.robustness.draws import SAFE, quantiles, why_of
+from companion.campaigns.runner import Row, counted, outcomes
 from companion.model.types import Outcome
 
-FIGURES = {
-    "bar_p_rms_m": ("place of the bar, mm RMS", 1e3),
-    "bar_tilt_rms_deg": ("tilt of the bar, deg RMS", 1.0),
-    "internal_force_rms_n": ("internal force, N RMS", 1.0),
-    "share": ("share of the left vehicle", 1.0),
-}
-"""Figures of a completed flight, as `summary.json` has them, with their names and scales for the table."""
+_SHOWN = tuple(key for key in FIGURES if key != "let_go")
+"""Figures of the table, of completed flights."""
 
 
 @dataclass(kw_only=True)
-class PairRobustness(Campaign):
+class PairRobustness(Drawn):
     """A campaign of a team; the configurations are those of the left and of the right member."""
-
-    name = "robustness"
-    csv_name = "draws.csv"
 
     team: str
     """Team file as named by the user."""
-    seed: int
 
     def job(self) -> Message:
         """Return the job for `sitl.campaigns`."""
@@ -44,17 +36,13 @@ class PairRobustness(Campaign):
         """Return the settings of the campaign for the results file."""
         return {**super().settings(), "team": self.team, "seed": self.seed}
 
-    def label(self, row: Row) -> str:
-        """Return the label that distinguishes a flight from the others."""
-        return str(row["name"])
-
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Return the outcomes and the distribution of each figure."""
         return {
             "summary": {
                 "flights": len(rows),
                 "outcomes": outcomes(rows),
-                **{key: quantiles(rows, key) for key in FIGURES},
+                **{key: _spread(rows, key) for key in _SHOWN},
             }
         }
 
@@ -86,33 +74,23 @@ class PairRobustness(Campaign):
         if any(row["outcome"] != Outcome.COMPLETED.value for row in rows):
             console.print(for_terminal(_ended_table(rows)), highlight=False)
 
-    def good(self, rows: Sequence[Row]) -> bool:
-        """Return whether every flight ended safely."""
-        return all(row["outcome"] in SAFE for row in rows)
 
-
-def quantiles(rows: Sequence[Row], key: str) -> dict[str, float | None]:
-    """Return median, 95th percentile and maximum of a figure over the completed flights."""
-    values = [row[key] for row in rows if row["outcome"] == Outcome.COMPLETED.value and row[key] is not None]
-    if not values:
-        return {"p50": None, "p95": None, "max": None}
-    p50, p95, most = np.percentile(values, (50, 95, 100)).tolist()
-    return {"p50": p50, "p95": p95, "max": most}
+def _spread(rows: Sequence[Row], key: str) -> dict[str, float | None]:
+    """Return the distribution of a figure over the completed flights."""
+    completed = [row for row in rows if row["outcome"] == Outcome.COMPLETED.value]
+    return quantiles([row[key] for row in completed if row[key] is not None])
 
 
 def _figures_table(rows: Sequence[Row]) -> Table:
     def of(which: str) -> Column:
         def show(key: str) -> str:
-            value = quantiles(rows, key)[which]
-            return number(None if value is None else value * FIGURES[key][1], ".2f", "–")
+            value = _spread(rows, key)[which]
+            return number(None if value is None else value * FIGURES[key][2], ".2f", "–")
 
         return Column(which, show)
 
-    return table(
-        (Column("figure", lambda key: FIGURES[key][0], left=True), of("p50"), of("p95"), of("max")),
-        list(FIGURES),
-        title="",
-    )
+    figure = Column("figure", lambda key: "{}, {}".format(*FIGURES[key]), left=True)
+    return table((figure, of("p50"), of("p95"), of("max")), _SHOWN, title="")
 
 
 def _ended_table(rows: Sequence[Row]) -> Table:
@@ -120,6 +98,6 @@ def _ended_table(rows: Sequence[Row]) -> Table:
     columns = (
         Column("flight", lambda row: str(row["name"]), left=True),
         Column("outcome", lambda row: str(row["outcome"]), left=True),
-        Column("why", lambda row: str(row["why"] or row["error"] or "no event gives a reason"), left=True),
+        Column("why", why_of, left=True),
     )
     return table(columns, ended, title="")

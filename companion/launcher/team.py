@@ -15,7 +15,7 @@ from typing import Any
 from rich.console import Console
 
 from companion.analysis.log import FlightLog
-from companion.analysis.pair import BarTruth, figures_of
+from companion.analysis.pair import BarTruth, figure_texts, figures_of
 from companion.analysis.summary import write_summary
 from companion.launcher.launcher import FlightResult, Launcher, Sitl
 from companion.launcher.reports import LAND_SIGNALS
@@ -160,7 +160,7 @@ def run_team(
             print_error(f"{out}: summary.json cannot be written: {error.strerror}")
             return EXIT_CODES[outcome]
     path = _write_reports(console, logs, truth, summary, out) if report else None
-    print_team_result(console, summary, path or out)
+    print_team_result(console, summary, figure_texts(summary["team"]), path or out)
     return EXIT_CODES[outcome]
 
 

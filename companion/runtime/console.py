@@ -347,11 +347,14 @@ def _print_facts(console: Console, facts: Sequence[tuple[str, str]]) -> None:
         console.print(f"{name:<{width}}  {text}", highlight=False, soft_wrap=True)
 
 
-def print_team_result(console: Console, summary: dict[str, Any], path: Path) -> None:
+def print_team_result(
+    console: Console, summary: dict[str, Any], figures: Sequence[tuple[str, str]], path: Path
+) -> None:
     """Print the result of two vehicles that carry a bar.
 
     Args:
-        summary: `outcome`, the worse one of both; `team`, with the figures of the bar; `members`, with the summary of each.
+        summary: `outcome`, the worse one of both; `members`, with the summary of each.
+        figures: names and texts of the figures of the bar.
         path: report of the flight, or the folder of a flight without one.
     """
     outcome = summary["outcome"]
@@ -364,14 +367,6 @@ def print_team_result(console: Console, summary: dict[str, Any], path: Path) -> 
         facts.append(
             (end, member["outcome"] + why + ("" if error_m is None else f", position error {error_m:.4f} m RMS"))
         )
-    team = summary["team"]
-    for name, key, unit in (
-        ("bar, position error", "bar_p_rms_m", "m RMS"),
-        ("bar, tilt", "bar_tilt_rms_deg", "deg RMS"),
-        ("internal force", "internal_force_rms_n", "N RMS"),
-        ("left vehicle's share", "share", "of the weight"),
-        ("let go", "let_go", "m above its stand"),
-    ):
-        facts.append((name, "-" if team[key] is None else f"{team[key]:.3f} {unit}"))
+    facts += figures
     facts.append(("report" if path.suffix == ".html" else "files", escape(str(path))))
     _print_facts(console, facts)

@@ -183,7 +183,7 @@ def assert_the_report_shows_both(out: Path, summary: dict[str, Any]) -> None:
     truth = from_jsonable(BarTruth, json.loads((out / "left" / BAR_FILE).read_text(encoding="utf-8")))
     left, right = (FlightLog.read(out / end / "flight.mcap") for end in ("left", "right"))
     page = write_pair_report(summary, truth, left, right, out).read_text(encoding="utf-8")
-    assert f"{summary['team']['bar_p_rms_m']:.3f} m" in page
+    assert f"{1e3 * summary['team']['bar_p_rms_m']:.2f} mm RMS" in page
     assert 'href="left/report.html"' not in page, "it was not written"
     movie = json.loads(page.split("id='movie'>")[1].split("</script>")[0])
     vehicles = [[shape for shape in frame[1:] if len(shape) > 20] for frame in movie["frames"]]

@@ -13,21 +13,35 @@ from companion.analysis.page import Page, Picture, Section
 from companion.analysis.table import Cell, Column, Table, for_terminal, number, table
 from companion.campaigns.process import Message
 from companion.campaigns.robustness.cases import Case, Cases, as_cases, case_name, fly_command, worse_than, write_cases
-from companion.campaigns.robustness.draws import DRAWN, DRIVERS, SAFE, drivers, influence, thirds, worst
+from companion.campaigns.robustness.draws import DRAWN, DRIVERS, SAFE, drivers, influence, thirds, why_of, worst
 from companion.campaigns.runner import Campaign, Row, catches, counted, outcomes, print_lines
 from companion.model.types import Outcome
 
 
 @dataclass(kw_only=True)
-class Robustness(Campaign):
-    """A campaign in randomly drawn worlds, or in the cases of a file."""
+class Drawn(Campaign):
+    """A campaign of flights with names, in worlds that a seed draws."""
 
     name = "robustness"
     csv_name = "draws.csv"
 
+    seed: int
+
+    def label(self, row: Row) -> str:
+        """Return the label that distinguishes a flight from the others."""
+        return str(row["name"])
+
+    def good(self, rows: Sequence[Row]) -> bool:
+        """Return whether every flight ended safely."""
+        return all(row["outcome"] in SAFE for row in rows)
+
+
+@dataclass(kw_only=True)
+class Robustness(Drawn):
+    """A campaign in randomly drawn worlds, or in the cases of a file."""
+
     mission: str
     """Mission file as named by the user."""
-    seed: int
     cases: Sequence[Case] = ()
     """The cases to fly; empty to fly draws."""
     cases_file: str | None = None
@@ -54,10 +68,6 @@ class Robustness(Campaign):
         law, preset = self.law
         own = {"mission": self.mission, "controller": law, "preset": preset}
         return {**super().settings(), **own, "seed": None if self.cases else self.seed, "cases": self.cases_file}
-
-    def label(self, row: Row) -> str:
-        """Return the label that distinguishes a flight from the others."""
-        return str(row["name"])
 
     def summary(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Return outcomes, catches, the distribution of the error and its correlations."""
@@ -121,17 +131,13 @@ class Robustness(Campaign):
         console.print(for_terminal(self._flights_table(rows)), highlight=False)
         for row in rows:
             if row["outcome"] != Outcome.COMPLETED.value:
-                text = f"{row['name']}: {row['outcome']}: {row['error'] or row['why'] or 'no event gives a reason'}"
+                text = f"{row['name']}: {row['outcome']}: {why_of(row)}"
                 console.print(text, style="yellow" if row["outcome"] in SAFE else "red", highlight=False, markup=False)
         hardest = worst(rows)[0]["world"]
         keys = hardest if self.cases else {key: hardest[key] for key in DRAWN}
         world = self.configs[0].laboratory.name
         line = fly_command(self.mission, law, preset, world, keys, self.overrides, self.vehicle)
         print_lines(console, f"to fly the worst world with companion fly:\n{line}")
-
-    def good(self, rows: Sequence[Row]) -> bool:
-        """Return whether every flight ended safely."""
-        return all(row["outcome"] in SAFE for row in rows)
 
     def _result(self, rows: Sequence[Row]) -> str:
         caught = sum(bool(row["caught"]) for row in rows)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from companion.campaigns.robustness.draws import SAFE
+from companion.campaigns.robustness.draws import SAFE, why_of
 from companion.campaigns.runner import Row
 from companion.config.base import Model, NonNegative
 from companion.config.document import ConfigError, problem_lines
@@ -139,7 +139,7 @@ def as_cases(rows: Sequence[Row]) -> tuple[Case, ...]:
 
 def worse_than(row: Row, kept: Kept) -> str | None:
     """Return what is worse than the recorded results, or None."""
-    outcome, why = row["outcome"], row["why"] or row["error"] or "no event gives a reason"
+    outcome, why = row["outcome"], why_of(row)
     if outcome != kept.outcome.value and outcome != Outcome.COMPLETED.value:
         return f"{outcome} ({why}), recorded as {kept.outcome.value}"
     if outcome not in SAFE:

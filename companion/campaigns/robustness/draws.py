@@ -110,15 +110,21 @@ def thirds(rows: Sequence[Row]) -> list[Third]:
         these = [
             r for r in rows if low <= r["world"]["payload_kg"] < high or (last and r["world"]["payload_kg"] == high)
         ]
-        errors = [row["e_p_m"] for row in graded(these)]
-        shares = np.percentile(errors, [50, 95, 100]).tolist() if errors else (None, None, None)
+        errors = quantiles([row["e_p_m"] for row in graded(these)])
         caught = sum(bool(row["caught"]) for row in these)
-        found.append(
-            Third(
-                (low, high), len(these), caught, catches(these), dict(zip(("p50", "p95", "max"), shares, strict=True))
-            )
-        )
+        found.append(Third((low, high), len(these), caught, catches(these), errors))
     return found
+
+
+def quantiles(values: Sequence[float]) -> dict[str, float | None]:
+    """Return median, 95th percentile and maximum; None without a value."""
+    found = np.percentile(values, (50, 95, 100)).tolist() if values else (None, None, None)
+    return dict(zip(("p50", "p95", "max"), found, strict=True))
+
+
+def why_of(row: Row) -> str:
+    """Return why a flight was not completed."""
+    return str(row["error"] or row["why"] or "no event gives a reason")
 
 
 def influence(rows: Sequence[Row]) -> dict[str, float]:
