@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import re
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
 from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
@@ -22,20 +18,18 @@ from pydantic import ValidationError
 from zstandard import ZstdError
 
 from companion import DISTRIBUTION
+from companion.analysis.columns import Columns, array_of, columns_of
 from companion.analysis.flat import flat
 from companion.analysis.logged_config import checked_config, checked_path
-from companion.analysis.timing import Stopwatch, Timing, plausible, timing_of
+from companion.analysis.timing import Array as Array
+from companion.analysis.timing import Stopwatch, Timing, timing_of
 from companion.config.loader import FlightConfig, logged_flight
 from companion.model.arm_skeleton import ArmSkeleton, logged_skeleton
-from companion.model.best_pose import best_pose
 from companion.model.codec import RecordError, from_json
-from companion.model.constants import GRADED_POSE_MAX_AGE_S
-from companion.model.frames import euler_zyx_from_quat
 from companion.model.outputs import Outputs, Sent
-from companion.model.types import Inputs, MocapPose
+from companion.model.types import Inputs
 from companion.plugins import PluginError
 
-Array = npt.NDArray[np.float64]
 _RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}
 _TOPICS = tuple(_RECORDS)
 """Topics in the order of a tick's records in the file."""
@@ -263,21 +257,7 @@ class FlightLog:
     @cached_property
     def columns(self) -> Columns:
         """Return the quantities that metrics and plots share, as arrays."""
-        return _columns(self)
-
-
-def array_of(values: Sequence[Any], width: int | None = None) -> Array:
-    """Return one row per value: a float (`width` None) or `width` floats; NaN where the value is None, or a number is infinite or so
-    large that no quantity of a flight has it.
-    """
-    if width is None:
-        found = np.array([math.nan if v is None else v for v in values], dtype=np.float64)
-    else:
-        blank = (math.nan,) * width
-        # Half the time that np.array needs for a list of tuples.
-        flat = np.fromiter(chain.from_iterable([blank if v is None else v for v in values]), np.float64)
-        found = flat.reshape(len(values), width)
-    return plausible(found)
+        return columns_of(self.rows(), self.joint_count)
 
 
 def _cells(record: Any) -> dict[str, Any]:
@@ -334,52 +314,6 @@ class _Rows:
     def measured(self) -> Timing | None:
         """Return the timing of all ticks, or None if all ticks are kept."""
         return self._stopwatch.read() if self._stopwatch is not None and self.stride > 1 else None
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Arrays with one row per tick; NaN where a value is unknown. World ENU, body FLU."""
-
-    t_s: Array
-    mission_t_s: Array
-    mocap_position_world_m: Array
-    """Position from valid frames with an age of `GRADED_POSE_MAX_AGE_S` or less; PX4's estimate if another program fed PX4."""
-    mocap_attitude_rad: Array
-    """Roll, pitch, yaw (ZYX)."""
-    mocap_age_s: Array
-    """Time from the frame's exposure to the tick."""
-    reference_position_world_m: Array
-    reference_velocity_world_m_s: Array
-    attitude_desired_rad: Array
-    arm_rad: Array
-    arm_reference_rad: Array
-    lateness_s: Array
-
-
-def _columns(log: FlightLog) -> Columns:
-    def graded(i: Inputs) -> MocapPose | None:
-        pose = best_pose(i)
-        fresh = pose is not None and pose.tracking_valid and i.t_s - pose.stamp_s <= GRADED_POSE_MAX_AGE_S
-        return pose if fresh else None
-
-    poses = [(i.t_s, graded(i)) for i in log.inputs]
-    return Columns(
-        t_s=log.column(lambda i, o, s: i.t_s),
-        mission_t_s=log.column(lambda i, o, s: o.mission_t_s),
-        mocap_position_world_m=array_of([pose.position_world_m if pose else None for _, pose in poses], 3),
-        mocap_attitude_rad=array_of(
-            [euler_zyx_from_quat(pose.attitude_wxyz) if pose else None for _, pose in poses], 3
-        ),
-        mocap_age_s=array_of([t_s - pose.stamp_s + (pose.latency_s or 0.0) if pose else None for t_s, pose in poses]),
-        reference_velocity_world_m_s=log.column(
-            lambda i, o, s: o.reference.velocity_world_m_s if o.reference else None, 3
-        ),
-        reference_position_world_m=log.column(lambda i, o, s: o.reference.position_world_m if o.reference else None, 3),
-        attitude_desired_rad=log.column(lambda i, o, s: o.control.attitude_desired_rad if o.control else None, 3),
-        arm_rad=log.column(lambda i, o, s: i.arm.angle_rad if i.arm else None, log.joint_count),
-        arm_reference_rad=log.column(lambda i, o, s: o.reference.arm_rad if o.reference else None, log.joint_count),
-        lateness_s=log.column(lambda i, o, s: s.lateness_s),
-    )
 
 
 def writer(metadata: dict[str, dict[str, str]]) -> str:
