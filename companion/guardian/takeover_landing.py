@@ -16,6 +16,7 @@ from companion.guardian.heartbeat import Heartbeat
 from companion.guardian.link import Link
 from companion.guardian.px4 import Px4State
 from companion.guardian.retreat import Retreat
+from companion.model.best_pose import tracked_pose
 from companion.model.flight_stage import is_killed
 from companion.model.types import (
     AutopilotRequest,
@@ -309,11 +310,4 @@ def _last_pose(last: Heartbeat) -> MocapPose | None:
     """Return the newest pose that the flight process accepted; None if there was none."""
     if last.pose_stamp_s == float("-inf"):
         return None
-    return MocapPose(
-        stamp_s=last.pose_stamp_s,
-        frame_number=0,
-        position_world_m=last.position_world_m,
-        attitude_wxyz=last.attitude_wxyz,
-        tracking_valid=True,
-        marker_error_m=0.0,
-    )
+    return tracked_pose(last.pose_stamp_s, last.position_world_m, last.attitude_wxyz)

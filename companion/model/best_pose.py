@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from companion.model.observations import Observations
-from companion.model.types import Inputs, MocapPose, VehicleState
+from companion.model.types import Inputs, MocapPose, Quat, Vec3, VehicleState
+
+
+def tracked_pose(stamp_s: float, position_world_m: Vec3, attitude_wxyz: Quat) -> MocapPose:
+    """Return a pose that is known without the frame that it came from."""
+    return MocapPose(
+        stamp_s=stamp_s,
+        frame_number=0,
+        position_world_m=position_world_m,
+        attitude_wxyz=attitude_wxyz,
+        tracking_valid=True,
+        marker_error_m=0.0,
+    )
 
 
 def estimated_pose(vehicle: VehicleState) -> MocapPose:
     """Return PX4's estimate in the form of a pose."""
-    return MocapPose(
-        stamp_s=vehicle.position_stamp_s,
-        frame_number=0,
-        position_world_m=vehicle.position_world_m,
-        attitude_wxyz=vehicle.attitude_wxyz,
-        tracking_valid=True,
-        marker_error_m=0.0,
-    )
+    return tracked_pose(vehicle.position_stamp_s, vehicle.position_world_m, vehicle.attitude_wxyz)
 
 
 def best_pose(i: Inputs) -> MocapPose | None:

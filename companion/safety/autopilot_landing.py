@@ -76,10 +76,10 @@ class LandingStep:
     """Requests of one tick of the landing."""
 
     request: AutopilotRequest
-    zero_thrust: bool
-    ended: bool
+    zero_thrust: bool = False
+    ended: bool = False
     """Whether the vehicle is disarmed on the ground, or nothing more can be done."""
-    landed: bool
+    landed: bool = False
     """Whether the vehicle has landed. Valid only if `ended` is True."""
     text: str | None = None
     """Event to report and its text, if any."""
@@ -200,53 +200,43 @@ class AutopilotLanding:
             now, takes_over = now._watch_mode(i)
             if takes_over:
                 text = KILLED if is_killed(i.status) else "a pilot took over"
-                return replace(now, pilot=True), LandingStep(
-                    request=AutopilotRequest.NONE, zero_thrust=False, ended=False, landed=False, text=text
-                )
+                return replace(now, pilot=True), LandingStep(AutopilotRequest.NONE, text=text)
         if now.pilot and heard and is_armed(i.status):  # a pilot may fly for any length of time
             now = replace(now, start_s=max(now.start_s, i.t_s - PILOT_S))
         if heard and not is_armed(i.status) and elapsed > 0.5:
             overturned = "the vehicle was flipped or tipped over; it is disarmed" if now.overturned else None
-            return now, LandingStep(
-                request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=True, text=overturned
-            )
+            return now, LandingStep(AutopilotRequest.NONE, ended=True, landed=True, text=overturned)
         if i.t_s - now.start_s > TIMEOUT_S:
             text = "the landing could not be confirmed"
-            return now, LandingStep(
-                request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=False, text=text
-            )
+            return now, LandingStep(AutopilotRequest.NONE, ended=True, text=text)
         if not heard:
             now, stands = now._watch_standing(i)
             if stands:
                 text = "PX4 does not answer; motion capture shows the vehicle at rest: approach with care and disarm it by hand"
-                return now, LandingStep(
-                    request=AutopilotRequest.NONE, zero_thrust=False, ended=True, landed=True, text=text
-                )
+                return now, LandingStep(AutopilotRequest.NONE, ended=True, landed=True, text=text)
         if now.pilot:
-            return now, LandingStep(AutopilotRequest.NONE, False, False, False)
+            return now, LandingStep(AutopilotRequest.NONE)
         if now.stop.overturned:
             found = None if now.overturned else FLIPPED if now.stop.flipped else TIPPED
             return replace(now, overturned=True), LandingStep(
-                request=AutopilotRequest.FORCE_DISARM, zero_thrust=True, ended=False, landed=False, text=found
+                AutopilotRequest.FORCE_DISARM, zero_thrust=True, text=found
             )
         if now.touched_s is None and heard:
             now, touches = now._watch_touchdown(i)
             if touches:
                 now = replace(now, touched_s=i.t_s)
-                return now, LandingStep(
-                    request=AutopilotRequest.LAND, zero_thrust=True, ended=False, landed=False, text="touchdown"
-                )
+                return now, LandingStep(AutopilotRequest.LAND, zero_thrust=True, text="touchdown")
         if now.touched_s is None:
             done = on_ground(i.status) and elapsed > 1.0 and now.stop.may_disarm
-            return now, LandingStep(AutopilotRequest.DISARM if done else AutopilotRequest.LAND, False, False, False)
+            return now, LandingStep(AutopilotRequest.DISARM if done else AutopilotRequest.LAND)
         if on_ground(i.status) and now.stop.may_disarm:
-            return now, LandingStep(AutopilotRequest.DISARM, True, False, False)
+            return now, LandingStep(AutopilotRequest.DISARM, zero_thrust=True)
         touched_s = now.touched_s
         now, unnoticed = now._watch_zero_thrust(i)
         if unnoticed:
-            return now, LandingStep(AutopilotRequest.FORCE_DISARM, True, False, False)
+            return now, LandingStep(AutopilotRequest.FORCE_DISARM, zero_thrust=True)
         wait = i.t_s - touched_s < ZERO_THRUST_STREAM_S or in_offboard(i.status)
-        return now, LandingStep(AutopilotRequest.NONE if wait else AutopilotRequest.OFFBOARD, True, False, False)
+        return now, LandingStep(AutopilotRequest.NONE if wait else AutopilotRequest.OFFBOARD, zero_thrust=True)
 
     def _watch_late(self, t_s: float, late: MocapPose | None) -> AutopilotLanding:
         sinking = self.late_sinking.update(t_s, late)
