@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import msgspec
+
 from companion.mission.plan import Plan
 from companion.mission.plan_builder import STOP_MIN_S
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED, slow_down, speed_up
@@ -112,13 +114,11 @@ def _paced(r: Reference, rate: float, change: float, jerk: float) -> Reference:
     ax, ay, az = r.acceleration_world_m_s2
     jx, jy, jz = r.jerk_world_m_s3
     arm_rate = r.arm_rate_rad_s
-    return Reference(
-        position_world_m=r.position_world_m,
+    return msgspec.structs.replace(
+        r,
         velocity_world_m_s=(rate * vx, rate * vy, rate * vz),
         acceleration_world_m_s2=(squared * ax + change * vx, squared * ay + change * vy, squared * az + change * vz),
-        yaw_rad=r.yaw_rad,
         yaw_rate_rad_s=rate * r.yaw_rate_rad_s,
-        arm_rad=r.arm_rad,
         arm_rate_rad_s=tuple([rate * da for da in arm_rate]),
         arm_acceleration_rad_s2=tuple(
             [squared * dda + change * da for dda, da in zip(r.arm_acceleration_rad_s2, arm_rate, strict=True)]

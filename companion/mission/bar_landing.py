@@ -8,7 +8,6 @@ from companion.config.vehicle import Vehicle
 from companion.control.manipulator import Manipulator
 from companion.mission.plan import BELOW_GROUND_M, Plan, fold_time_s
 from companion.mission.plan_builder import PlanBuilder
-from companion.mission.segments import Segment
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
 from companion.model.types import Joints, PhaseKind, Reference, Vec3
 
@@ -54,7 +53,7 @@ def landing_with_bar(
     builder.t_s = builder.descend(speed_m_s, stands_m - PRESS_M + drop_m)
     opens_s = builder.t_s + STAND_S
     builder.t_s = opens_s + OPENING_S
-    _segment(builder, "set the bar down", 0.0)
+    builder.end_segment("set the bar down", PhaseKind.LANDING)
     begun_s = builder.t_s
     x, y, z = builder.position_m
     builder.go((x, y, z + RISE_M), RISE_S)
@@ -66,12 +65,7 @@ def landing_with_bar(
     dx, dy, _ = quat_rotate(quat_from_euler_zyx(0.0, 0.0, now.yaw_rad), (-BACK_M, 0.0, 0.0))
     builder.go((x + dx, y + dy, z + RISE_M), BACK_S)
     builder.t_s = max(builder.t_s + BACK_S, folded_s - FOLDED_S)
-    _segment(builder, "leave the bar", begun_s)
-    begun_s = builder.t_s
+    builder.end_segment("leave the bar", PhaseKind.LANDING)
     builder.t_s = builder.descend(speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
-    _segment(builder, "land", begun_s)
+    builder.end_segment("land", PhaseKind.LANDING)
     return Plan.of(builder), opens_s
-
-
-def _segment(builder: PlanBuilder, name: str, begun_s: float) -> None:
-    builder.segments.append(Segment(name=name, kind=PhaseKind.LANDING, start_s=begun_s, end_s=builder.t_s, index=-1))

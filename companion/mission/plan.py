@@ -78,14 +78,9 @@ class Plan:
         limits, arm_limits = _vehicle_limits(mission), _arm_limits(mission, vehicle)
         phases, flown = phases_of(mission), flown_phases(mission)
         for index, repetition in flown:
-            phase, start_s = phases[index], builder.t_s
+            phase = phases[index]
             phase.plan(Planning(builder, mission, vehicle, limits, arm_limits, phases[:index]))
-            name = counted(phase.title, repetition, mission.repeat)
-            builder.segments.append(
-                Segment(
-                    name=name, kind=phase.kind, start_s=start_s, end_s=builder.t_s, index=index, repetition=repetition
-                )
-            )
+            builder.end_segment(counted(phase.title, repetition, mission.repeat), phase.kind, index, repetition)
         repeats = repeats_of(mission, builder.segments, tuple([phase.title for phase in phases[1:-1]]))
         return cls.of(builder, repeats)
 
@@ -140,14 +135,8 @@ class Plan:
         number = min(number, len(repeats.names) - 1)
         like = self.segments[repeats.first + number]
         name = counted(repeats.names[number], before + 2, repeats.count)
-        return Segment(
-            name=name,
-            kind=like.kind,
-            start_s=like.start_s + shift_s,
-            end_s=like.end_s + shift_s,
-            index=like.index,
-            repetition=before + 2,
-        )
+        start_s, end_s = like.start_s + shift_s, like.end_s + shift_s
+        return replace(like, name=name, start_s=start_s, end_s=end_s, repetition=before + 2)
 
     def progress(self, t_s: float) -> float:
         """Return the completed fraction of the whole duration, 0 to 1."""
@@ -190,11 +179,10 @@ def landing_from(
     reach_m = vehicle.reach_m - arm.first_joint_body_m[2] + vehicle.tip_radius_m
     free_s = max(0.0, builder.height_m - reach_m) / speed_m_s
     builder.t_s = max(stop_s, back_s + fold_s - free_s)
-    builder.segments.append(Segment(name="stop", kind=PhaseKind.LANDING, start_s=back_s, end_s=builder.t_s, index=-1))
-    start_s = builder.t_s
+    builder.end_segment("stop", PhaseKind.LANDING)
     end_s = builder.descend(speed_m_s, vehicle.airframe.ground_clearance_m - BELOW_GROUND_M)
     builder.t_s = max(end_s, back_s + fold_s)
-    builder.segments.append(Segment(name="land", kind=PhaseKind.LANDING, start_s=start_s, end_s=builder.t_s, index=-1))
+    builder.end_segment("land", PhaseKind.LANDING)
     return Plan.of(builder)
 
 
@@ -202,8 +190,8 @@ def go_back(builder: PlanBuilder, to_m: Vec3, kind: PhaseKind) -> Vec3:
     """Begin a plan with the way back from a surface; return the velocity at its end."""
     duration_s = max(BACK_MIN_S, REST_TO_REST_PEAK_SPEED * builder.line_m(to_m) / BACK_SPEED_M_S)
     builder.go(to_m, duration_s)
-    builder.segments.append(Segment(name="back", kind=kind, start_s=0.0, end_s=duration_s, index=-1))
     builder.t_s = duration_s
+    builder.end_segment("back", kind)
     return (0.0, 0.0, 0.0)
 
 

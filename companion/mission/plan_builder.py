@@ -26,7 +26,7 @@ from companion.mission.reference import (
 )
 from companion.mission.segments import Segment
 from companion.model.frames import wrap_rad
-from companion.model.types import Joints, Vec3
+from companion.model.types import Joints, PhaseKind, Vec3
 
 LAND_SPEED_UP_S = 1.0
 LAND_SLOW_DOWN_S = 0.5
@@ -208,6 +208,11 @@ class PlanBuilder:
                 )
                 t_s += duration_s
         return t_s
+
+    def end_segment(self, name: str, kind: PhaseKind, index: int = -1, repetition: int = 0) -> None:
+        """Append the segment from the end of the previous one, or from 0, to `t_s`; the other arguments are fields of `Segment`."""
+        start_s = self.segments[-1].end_s if self.segments else 0.0
+        self.segments.append(Segment(name, kind, start_s, self.t_s, index, repetition))
 
     def tracks(self) -> tuple[Track, Track, Track]:
         """Return the tracks of the position, the yaw and the arm."""

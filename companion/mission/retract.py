@@ -9,7 +9,6 @@ from companion.config.vehicle import Vehicle
 from companion.mission.plan import Plan, fold_time_s, go_back
 from companion.mission.plan_builder import PlanBuilder, stopping
 from companion.mission.reference import REST_TO_REST_PEAK_SPEED
-from companion.mission.segments import Segment
 from companion.model.types import Joints, PhaseKind, Vec2, Vec3
 
 LEAST_WAY_M = 0.5
@@ -67,7 +66,7 @@ def retract_from(
     builder.fold_arm(arm_fold_rad, fold_s)
     velocity, stop_s = stopping(inward_only(velocity_world_m_s, position_world_m, anchor))
     builder.t_s = builder.stop_within(_never_outward(velocity, stop_s, position_world_m, anchor), stop_s)
-    segments = [Segment(name="stop", kind=PhaseKind.FLIGHT, start_s=back_s, end_s=builder.t_s, index=-1)]
+    builder.end_segment("stop", PhaseKind.FLIGHT)
     x, y, z = builder.position_m
     away_m = math.hypot(x - anchor[0], y - anchor[1])
     lever_m = math.hypot(*tether.attachment_body_m)
@@ -83,10 +82,7 @@ def retract_from(
         builder.go((*to, z), duration_s)
         builder.t_s = start_s + duration_s
     builder.t_s = max(builder.t_s, back_s + fold_s)
-    segments.append(
-        Segment(name="return", kind=PhaseKind.FLIGHT, start_s=segments[0].end_s, end_s=builder.t_s, index=-1)
-    )
-    builder.segments += segments
+    builder.end_segment("return", PhaseKind.FLIGHT)
     return Plan.of(builder)
 
 
