@@ -136,7 +136,11 @@ def test_members_that_are_far_apart_in_their_plans_do_not_continue_but_set_the_b
     ],
     ids=["another version of the mission", "the same system id", "another server"],
 )
-def test_with_a_member_that_does_not_go_with_it_a_vehicle_arms_nothing(changed: dict[str, object], text: str) -> None:
+def test_with_a_member_that_does_not_go_with_it_a_vehicle_arms_nothing(
+    changed: dict[str, object], text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """How long it waits: tests/core/test_sequence.py."""
+    monkeypatch.setattr("companion.model.flight_stage.WAIT_TIMEOUT_S", 1.0)
     team = team_of()
     right = team.flights[1]
     announced = right.announced
@@ -146,7 +150,7 @@ def test_with_a_member_that_does_not_go_with_it_a_vehicle_arms_nothing(changed: 
         return None if said is None else replace(said, **changed)
 
     right.announced = other  # type: ignore[method-assign]
-    left = team.run(15.0).members[0]
+    left = team.run(2.0).members[0]
     (refused,) = [event.text for outputs in left.outputs for event in outputs.events if event.id == "start_refused"]
     assert text in refused
     assert left.outputs[-1].outcome is Outcome.REFUSED
