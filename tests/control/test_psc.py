@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,7 @@ from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from tests.analysis.recorded import record
 from tests.control.states import POSE, at, at_rest
-from tests.flights.ends import after
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
-from tests.support import SHORT_CATCH
 
 MISSION = "configs/missions/catch.yaml"
 MASS_KG, G = 3.0, 9.81
@@ -42,9 +41,11 @@ def controller(config: SitlConfig) -> PscController:
     return PscController(law(config), config.vehicle, 0.49)
 
 
-def flown(*overrides: str) -> FastResult:
-    """The mission up to 3.5 s after the catch."""
-    return FastFlight(configured(*overrides)).run(until_mission_s=10.0)
+@cache
+def flown() -> tuple[FastFlight, FastResult]:
+    """The mission with 0.3 kg up to 3.5 s after the catch."""
+    flight = FastFlight(configured("world.payload_kg=0.3"))
+    return flight, flight.run(until_mission_s=10.0)
 
 
 REFERENCE = replace(
@@ -121,7 +122,7 @@ def test_no_estimate_without_its_switch() -> None:
 
 def test_it_carries_the_payload_and_its_mass_estimate_converges() -> None:
     """Within 20 %, from thrust and IMU alone, with their noise; from 2 s after the catch on."""
-    result = flown("world.payload_kg=0.3")
+    _, result = flown()
     assert event_ids(result) == ["takeoff", "catch"]
     assert error_after_catch_m(result) <= 0.03
     catch_s = next(event.t_s for outputs in result.outputs for event in outputs.events if event.id == "catch")
@@ -135,8 +136,7 @@ def test_it_carries_the_payload_and_its_mass_estimate_converges() -> None:
 
 
 def test_the_estimate_is_in_the_log_and_comes_out_of_a_replay_bit_for_bit(tmp_path: Path) -> None:
-    flight = FastFlight(load_sitl(SHORT_CATCH, controller_law="psc"))
-    result = flight.run(until=after("catch", 0.5))
+    flight, result = flown()
     log = FlightLog.read(record(log_of(flight.config.flight, result, None), tmp_path / "flight.mcap"))
     estimates = [o.control.payload_estimate_kg for o in log.outputs if o.control is not None]
     assert None not in estimates
