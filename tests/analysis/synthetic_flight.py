@@ -252,6 +252,20 @@ def synthetic_flight(end_s: float = LANDED_S, rate_hz: float = RATE_HZ) -> Itera
         yield inputs, outputs, sent
 
 
+def sent_at(tick: int, t_s: float) -> Sent:
+    """Return plausible times: the fast loop has no wires."""
+    return Sent(
+        tick=tick,
+        attitude_sent=True,
+        start_s=t_s - 0.0008,
+        lateness_s=0.0003,
+        joint_read_s=t_s,
+        core_s=t_s + 0.0002,
+        setpoint_sent_s=t_s + 0.0004,
+        current_sent_s=t_s + 0.0003,
+    )
+
+
 def log_of_rows(
     rows: Iterable[tuple[Inputs, Outputs, Sent]],
     config: dict[str, Any] = CONFIG,

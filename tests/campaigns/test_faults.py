@@ -210,13 +210,7 @@ def pose(frame: int, stamp_s: float) -> Inputs:
         tracking_valid=True,
         marker_error_m=0.0,
     )
-    return Inputs(
-        tick=frame,
-        t_s=stamp_s,
-        mocap=seen,
-        command=OperatorCommand.NONE,
-        recorder_dropped=0,
-    )
+    return Inputs(tick=frame, t_s=stamp_s, mocap=seen, command=OperatorCommand.NONE, recorder_dropped=0)
 
 
 def test_the_clocks_are_compared_by_the_frame_nearest_to_the_fault_that_both_know() -> None:

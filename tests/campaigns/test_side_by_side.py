@@ -19,13 +19,7 @@ from companion.campaigns.side_by_side.page import write_html
 from companion.campaigns.side_by_side.plots import write_pictures
 from companion.model.outputs import Outputs, Sent
 from companion.model.types import Event, Inputs, SafetyAction, Severity
-from tests.analysis.synthetic_flight import (
-    CATCH_S,
-    CONFIG,
-    GROUND_S,
-    log_of_rows,
-    synthetic_flight,
-)
+from tests.analysis.synthetic_flight import CATCH_S, CONFIG, GROUND_S, log_of_rows, synthetic_flight
 
 Row = tuple[Inputs, Outputs, Sent]
 ROWS = list(synthetic_flight(rate_hz=50.0))

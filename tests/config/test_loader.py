@@ -280,14 +280,8 @@ def test_unknown_controller_and_preset(project: Path) -> None:
 
 
 BAD_LAW_IN_MISSION = [
-    (
-        "{law: psk}",
-        'controller.law: expected one of "adaptive", "csc", "psc", "policy", got "psk" (did you mean psc?)',
-    ),
-    (
-        "{law: psc, preset: paper}",
-        "controller.preset: 'psc' has no preset \"paper\"; available: tuned_extras, tuned",
-    ),
+    ("{law: psk}", 'controller.law: expected one of "adaptive", "csc", "psc", "policy", got "psk" (did you mean psc?)'),
+    ("{law: psc, preset: paper}", "controller.preset: 'psc' has no preset \"paper\"; available: tuned_extras, tuned"),
 ]
 
 

@@ -152,11 +152,7 @@ def test_a_way_back_that_takes_too_long_becomes_a_landing() -> None:
 
 @pytest.mark.parametrize(
     ("command", "overrides", "stolen_s"),
-    [
-        (OperatorCommand.HOLD, HIGHER, 6.4),
-        (OperatorCommand.NONE, TAUT, 5.0),
-        (OperatorCommand.LAND, HIGHER, 6.4),
-    ],
+    [(OperatorCommand.HOLD, HIGHER, 6.4), (OperatorCommand.NONE, TAUT, 5.0), (OperatorCommand.LAND, HIGHER, 6.4)],
     ids=["in a hold", "in a retract", "in a landing"],
 )
 def test_a_pilot_who_takes_over_is_left_alone(
@@ -203,10 +199,7 @@ def test_a_pilot_who_takes_over_after_touch_down_is_not_disarmed() -> None:
     assert event_ids(result) == ["takeoff", "touchdown", "pilot_took_over"]
     last = result.inputs[-1].status
     assert last is not None and last.armed, "PX4 disarms when the pilot has landed"
-    assert not {o.request for o in result.outputs} & {
-        AutopilotRequest.DISARM,
-        AutopilotRequest.FORCE_DISARM,
-    }
+    assert not {o.request for o in result.outputs} & {AutopilotRequest.DISARM, AutopilotRequest.FORCE_DISARM}
     assert not result.crashed
 
 

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cache
-from types import TracebackType
 from typing import Any, Self
 
 from aiohttp import WSMsgType, web
@@ -35,11 +34,11 @@ from companion.ground.station.web_guard import HEADERS
 from companion.ground.telemetry.scene import scene_of
 from companion.ground.telemetry.stream import replay
 from companion.model.codec import to_jsonable
-from companion.model.outputs import Sent
 from companion.model.types import OperatorCommand
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
+from tests.analysis.synthetic_flight import sent_at
 from tests.ground.vehicle import ack_of, state_of
 from tests.support import CATCH, DEADLINE_S
 
@@ -76,20 +75,6 @@ def flown() -> Flown:
     path = [o.reference.position_world_m for o in result.outputs if o.reference is not None]
     scene = scene_of(config, SESSION, path[:: max(1, len(path) // 290)], mission_s=result.outputs[-1].mission_t_s)
     return Flown(scene, tuple(streams), events)
-
-
-def sent_at(tick: int, t_s: float) -> Sent:
-    """Return plausible times: the fast loop has no wires."""
-    return Sent(
-        tick=tick,
-        attitude_sent=True,
-        start_s=t_s - 0.0008,
-        lateness_s=0.0003,
-        joint_read_s=t_s,
-        core_s=t_s + 0.0002,
-        setpoint_sent_s=t_s + 0.0004,
-        current_sent_s=t_s + 0.0003,
-    )
 
 
 def state(presence: Presence = Presence.FLYING, **changes: Any) -> State:
@@ -157,9 +142,7 @@ class MonitorStub:
         self.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()

@@ -29,15 +29,7 @@ from companion.model.frames import quat_from_euler_zyx, quat_multiply
 from companion.model.markers import BallState
 from companion.model.outputs import ActiveRule, Outputs, Sent
 from companion.model.team import BarPose
-from companion.model.types import (
-    AttitudeSetpoint,
-    Event,
-    Inputs,
-    PhaseKind,
-    SafetyAction,
-    Severity,
-    VehicleState,
-)
+from companion.model.types import AttitudeSetpoint, Event, Inputs, PhaseKind, SafetyAction, Severity, VehicleState
 from companion.safety.rule import Lamp, Rule
 from companion.safety.rules import RULES
 from tests.analysis.synthetic_flight import synthetic_flight

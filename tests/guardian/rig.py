@@ -14,7 +14,6 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -77,9 +76,7 @@ class Cameras:
         assert self._started.wait(DEADLINE_S)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop.set()
         self._thread.join(DEADLINE_S)
 
@@ -178,9 +175,7 @@ class Rig:
             socket.send_fds(self.beats, [heartbeat.RECORDER_CHANNEL], [recorder.fileno()])
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for process in (self.guardian, self.flight):
             if process.poll() is None:
                 process.kill()

@@ -10,12 +10,7 @@ import pytest
 
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.types import (
-    AttitudeSetpoint,
-    AutopilotRequest,
-    AutopilotStatus,
-    MocapPose,
-)
+from companion.model.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, MocapPose
 from companion.runtime.clock import Clock, flight_clock
 from tests.io.stub_rig import standing_stub
 from tests.io.test_px4 import edge

@@ -16,16 +16,7 @@ from companion.config.mission import Mission
 from companion.mission import minsnap
 from companion.mission.plan import BELOW_GROUND_M, Plan, landing_from
 from companion.mission.plan_builder import STOP_SPEED_MAX_M_S
-from companion.mission.reference import (
-    Move,
-    Profile,
-    Track,
-    minimum_snap,
-    rest_to_rest,
-    slow_down,
-    speed_up,
-    steady,
-)
+from companion.mission.reference import Move, Profile, Track, minimum_snap, rest_to_rest, slow_down, speed_up, steady
 from companion.model.types import Joints, PhaseKind, Reference, Vec3
 from tests.control.states import at_rest
 from tests.support import tool_of

@@ -44,10 +44,7 @@ def read_one(server: NatNetServer, multicast: bool, deadline_s: float = 20.0) ->
     return info, frames[0], models[0]
 
 
-@pytest.mark.parametrize(
-    ("version", "multicast"),
-    [("3.0", False), ("3.1", True), ("4.1", False), ("4.4", True)],
-)
+@pytest.mark.parametrize(("version", "multicast"), [("3.0", False), ("3.1", True), ("4.1", False), ("4.4", True)])
 async def test_peer_reads_the_right_poses(version: str, multicast: bool) -> None:
     async def publish(server: NatNetServer) -> None:
         t_s = 0.0

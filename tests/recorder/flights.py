@@ -10,11 +10,12 @@ from pathlib import Path
 from msgspec.structs import replace
 
 from companion.config.loader import load_flight
-from companion.model.outputs import Outputs, Sent, TetherState
+from companion.model.outputs import Outputs, Sent
 from companion.model.types import Inputs
 from companion.recorder.client import RecorderProcess
 from sitl.fast.result import FastResult
-from tests.analysis.synthetic_flight import synthetic_flight
+from tests.analysis.synthetic_flight import sent_at, synthetic_flight
+from tests.safety.healthy import SLOW
 from tests.support import DEADLINE_S
 
 Row = tuple[Inputs, Outputs, Sent]
@@ -29,41 +30,15 @@ def config_json() -> str:
 def flight_of(result: FastResult) -> Iterator[Row]:
     """Yield the rows of a flight of the fast loop, with plausible times because it has no wires."""
     for i, o in zip(result.inputs, result.outputs, strict=True):
-        t_s = i.t_s
-        yield (
-            i,
-            o,
-            Sent(
-                tick=i.tick,
-                attitude_sent=o.attitude is not None,
-                arm_torque_sent_nm=o.arm_torque_nm,
-                start_s=t_s - 0.0008,
-                lateness_s=0.0003,
-                joint_read_s=t_s,
-                core_s=t_s + 0.0002,
-                setpoint_sent_s=t_s + 0.0004,
-                current_sent_s=t_s + 0.0003,
-            ),
-        )
+        sent = sent_at(i.tick, i.t_s)
+        yield i, o, replace(sent, attitude_sent=o.attitude is not None, arm_torque_sent_nm=o.arm_torque_nm)
 
 
 def tethered(end_s: float) -> Iterator[Row]:
     """Yield the synthetic flight up to a mission time, with a tether that becomes nearly taut."""
     for inputs, outputs, sent in synthetic_flight(end_s=end_s):
         slack_m = 0.8 + 0.7 * math.cos(outputs.mission_t_s)
-        state = TetherState(
-            range_m=3.0 - slack_m,
-            slack_m=slack_m,
-            stop_slack_m=slack_m - 0.05,
-            elevation_rad=0.3,
-            clearance_m=0.5,
-            turns=0.0,
-            pull_n=0.0,
-            taut=slack_m < 0.15,
-            snagged=False,
-            separated=False,
-            vehicle_turns=0.0,
-        )
+        state = replace(SLOW, range_m=3.0 - slack_m, slack_m=slack_m, stop_slack_m=slack_m - 0.05, taut=slack_m < 0.15)
         yield inputs, replace(outputs, tether=state), sent
 
 

@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,11 +32,15 @@ from tests.support import CATCH, DEADLINE_S, wait_until
 
 M = TypeVar("M")
 Row = tuple[Inputs, Outputs, Sent]
-ROWS: list[Row] = list(synthetic_flight(end_s=21.0))
 ANNA = new_key()
 VEHICLE = "rig-7"
 STREAM_TICKS = 10
 """Ticks in a period of the stream, 20 Hz."""
+
+
+@cache
+def rows() -> list[Row]:
+    return list(synthetic_flight(end_s=21.0))
 
 
 class Listener:
@@ -121,7 +126,7 @@ class Flight:
 
     def fly(self, until: int) -> None:
         """Send ticks up to a number, faster than real time; none may be dropped."""
-        for row in ROWS[self._next : until]:
+        for row in rows()[self._next : until]:
             select.select([], [self.recorder.client], [], DEADLINE_S)
             self.recorder.client.record(*row)
         self._next = until
@@ -135,7 +140,7 @@ class Flight:
         def look() -> bool:
             if next(looks) % 10 == 0:
                 self.fly(self._next + 1)
-                assert self._next < len(ROWS), why
+                assert self._next < len(rows()), why
             return condition()
 
         wait_until(look, lambda: f"{why}: {self.recorder.client.telemetry_status}")

@@ -34,6 +34,7 @@ from companion.model.types import (
     Severity,
 )
 from companion.recorder.client import RecorderClient, RecorderProcess, epoch_offset_ns
+from tests.analysis.synthetic_flight import sent_at
 from tests.support import DEADLINE_S
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -58,13 +59,7 @@ def tick(k: int, text: str = "") -> tuple[Inputs, Outputs, Sent]:
         (Event(t_s=t_s, id="note", severity=Severity.WARNING, action=SafetyAction.WARN, text=text),) if text else ()
     )
     return (
-        Inputs(
-            tick=k,
-            t_s=t_s,
-            mocap=pose,
-            command=OperatorCommand.NONE,
-            recorder_dropped=0,
-        ),
+        Inputs(tick=k, t_s=t_s, mocap=pose, command=OperatorCommand.NONE, recorder_dropped=0),
         Outputs(
             tick=k,
             t_s=t_s,
@@ -78,16 +73,7 @@ def tick(k: int, text: str = "") -> tuple[Inputs, Outputs, Sent]:
             mocap_trusted=True,
             limited_by=(),
         ),
-        Sent(
-            tick=k,
-            attitude_sent=False,
-            start_s=t_s,
-            lateness_s=1e-4,
-            joint_read_s=t_s,
-            core_s=t_s,
-            setpoint_sent_s=t_s,
-            current_sent_s=t_s,
-        ),
+        sent_at(k, t_s),
     )
 
 

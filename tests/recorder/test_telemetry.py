@@ -26,7 +26,7 @@ from companion.ground.protocol.messages import (
 )
 from companion.model.types import GroundCommand, OperatorCommand, Severity
 from tests.broker import Broker, loopback_broker
-from tests.recorder.telemetry_rig import ROWS, VEHICLE, Listener, flight_with, log_lines
+from tests.recorder.telemetry_rig import VEHICLE, Listener, flight_with, log_lines, rows
 from tests.support import DEADLINE_S, free_port, wait_until
 from tools.docs.telemetry import schema_of
 
@@ -47,13 +47,13 @@ def test_every_topic_follows_its_schema_and_is_there_for_those_who_come_late(tmp
         flight.fly(600)
         client.text(2.9, Severity.WARNING, "px4", "Preflight Fail: ears are cold")
         asked = GroundCommand(command=OperatorCommand.HOLD, operator="anna", nonce="0" * 32, hold=0, t_s=3.0)
-        client.ack(asked, True, "holding", ROWS[600][1])
+        client.ack(asked, True, "holding", rows()[600][1])
         flight.fly(2000)
         listener.wait(Topic.STREAM, Stream, lambda stream: stream.t_s > 5.0)
-        flight.fly(len(ROWS))
+        flight.fly(len(rows()))
         report = flight.finish()
         listener.wait(Topic.STATE, State, lambda state: state.presence is Presence.ENDED)
-        assert (report.samples, report.dropped, report.error) == (len(ROWS), 0, None)
+        assert (report.samples, report.dropped, report.error) == (len(rows()), 0, None)
         for topic in Topic:
             heard = listener.of(topic)
             assert heard or topic is Topic.COMMAND
@@ -69,7 +69,7 @@ def test_every_topic_follows_its_schema_and_is_there_for_those_who_come_late(tmp
         streams = [decode(Stream, payload) for payload in listener.of(Topic.STREAM)]
         assert [stream.seq for stream in streams] == sorted({stream.seq for stream in streams})
         assert {stream.session for stream in streams} == {state.session}
-        assert streams[-1].t_s == pytest.approx(ROWS[-1][0].t_s, abs=1e-3)
+        assert streams[-1].t_s == pytest.approx(rows()[-1][0].t_s, abs=1e-3)
     assert (state.vehicle, state.simulated, state.mission, state.law) == (VEHICLE, True, "catch", "adaptive")
     with Listener(broker.port) as late:
         ended = late.wait(Topic.STATE, State)
@@ -81,11 +81,11 @@ def test_every_topic_follows_its_schema_and_is_there_for_those_who_come_late(tmp
         assert [(row.id, row.level, row.text) for row in preflight.rows] == [("px4", "ok", "well")]
         events = late.wait(Topic.EVENTS, Events)
         assert set(late.retained()) == RETAINED
-    reported = [event.id for row in ROWS for event in row[1].events]
+    reported = [event.id for row in rows() for event in row[1].events]
     assert sorted(line.id for line in events.lines) == sorted([*reported, "px4"])
     assert events.count == len(reported) + 1
     log = FlightLog.read(flight.path)
-    assert len(log.inputs) == len(ROWS)
+    assert len(log.inputs) == len(rows())
     assert log.metadata["recorder"]["session"] == state.session
     # The log is closed before the last one leaves.
     assert int(log.metadata["recorder"]["stream_sent"]) >= len(streams) - 1
@@ -156,12 +156,12 @@ def test_a_broker_that_dies_and_comes_back_costs_no_sample_and_is_reported_every
                 lambda: (flight.recorder.client.telemetry_status or "").startswith("connected"),
                 "the flight does not report the return",
             )
-            flight.fly(len(ROWS))
+            flight.fly(len(rows()))
             report = flight.finish()
             listener.wait(Topic.STATE, State, lambda state: state.presence is Presence.ENDED)
-    assert (report.samples, report.dropped, report.error) == (len(ROWS), 0, None)
+    assert (report.samples, report.dropped, report.error) == (len(rows()), 0, None)
     log = FlightLog.read(flight.path)
-    assert len(log.inputs) == len(ROWS)
+    assert len(log.inputs) == len(rows())
     assert int(log.metadata["recorder"]["broker_connections"]) == 2
     reported = [line for line in log_lines(flight.path) if "broker at" in line or "connected to" in line]
     assert len(reported) == 3, reported
@@ -171,13 +171,13 @@ def test_a_broker_that_takes_nothing_costs_no_sample_and_holds_nobody(tmp_path: 
     with Listener(broker.port) as listener, flight_with(tmp_path, broker.url) as flight:
         flight.begin(listener)
         broker.signal(signal.SIGSTOP)
-        flight.fly(len(ROWS))
+        flight.fly(len(rows()))
         report = flight.finish()
         broker.signal(signal.SIGCONT)
-        assert (report.samples, report.dropped, report.error) == (len(ROWS), 0, None)
+        assert (report.samples, report.dropped, report.error) == (len(rows()), 0, None)
         # It could not receive the end in time: then the last word is the will's, or the end if it took that after all.
         listener.wait(Topic.STATE, State, lambda state: state.presence in (Presence.LOST, Presence.ENDED))
-    assert len(FlightLog.read(flight.path).inputs) == len(ROWS)
+    assert len(FlightLog.read(flight.path).inputs) == len(rows())
 
 
 def test_no_broker_at_all_is_reported_once_and_costs_no_sample(tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_no_broker_at_all_is_reported_once_and_costs_no_sample(tmp_path: Path) -
         assert flight.recorder.client.telemetry_status == f"no broker at {url}, trying: Connection refused"
         # Its thread yields to everything; 21 s of ticks in a moment could be over before it has written its line.
         flight.wait(lambda: any("no broker" in line for line in log_lines(flight.path)), "not in the log")
-        flight.fly(len(ROWS))
+        flight.fly(len(rows()))
         report = flight.finish()
-    assert (report.samples, report.dropped, report.error) == (len(ROWS), 0, None)
+    assert (report.samples, report.dropped, report.error) == (len(rows()), 0, None)
     assert sum("no broker" in line for line in log_lines(flight.path)) == 1

@@ -30,7 +30,7 @@ from companion.model.codec import to_json
 from companion.model.types import GroundCommand, OperatorCommand
 from tests.broker import Broker, loopback_broker
 from tests.ground.test_broker import WANTED, Site, running
-from tests.recorder.telemetry_rig import ROWS, VEHICLE, Listener, command, config_of, flight_with, log_lines
+from tests.recorder.telemetry_rig import VEHICLE, Listener, command, config_of, flight_with, log_lines, rows
 from tests.support import CATCH, DEADLINE_S, free_port
 
 
@@ -61,7 +61,7 @@ def test_a_signed_command_reaches_the_flight_and_its_answer_comes_back(tmp_path:
         assert (asked.command, asked.operator, asked.nonce) == (
             OperatorCommand.HOLD, "anna", json.loads(genuine)["nonce"],
         )  # fmt: skip
-        client.ack(asked, True, "holding", ROWS[1000][1])
+        client.ack(asked, True, "holding", rows()[1000][1])
         flight.fly(2000)
         answer = listener.wait(Topic.ACK, Ack, lambda ack: ack.accepted)
         assert (answer.nonce, answer.text, answer.session) == (asked.nonce, "holding", state.session)
@@ -73,7 +73,7 @@ def test_a_signed_command_reaches_the_flight_and_its_answer_comes_back(tmp_path:
         reported = {line.id: line.text for line in events.lines}
         assert "not signed with the key of anna" in reported["command_refused_bad_signature"]
         assert "another flight" in reported["command_refused_wrong_session"]
-        flight.fly(len(ROWS))
+        flight.fly(len(rows()))
         assert client.take_commands() == []
         assert len(listener.of(Topic.ACK)) == 2
         assert flight.finish().error is None
@@ -131,12 +131,12 @@ def test_a_flood_of_rubbish_passes_nothing_costs_no_sample_and_does_not_drown_th
 
         flight.wait(came, "no ground station commands any more")
         took_s = time.monotonic() - began_s
-        flight.fly(len(ROWS))
+        flight.fly(len(rows()))
         report = flight.finish()
     assert {asked.command for asked in heard} == {OperatorCommand.HOLD}
-    assert (report.samples, report.dropped, report.error) == (len(ROWS), 0, None)
+    assert (report.samples, report.dropped, report.error) == (len(rows()), 0, None)
     log = FlightLog.read(flight.path)
-    assert len(log.inputs) == len(ROWS)
+    assert len(log.inputs) == len(rows())
     refused = int(log.metadata["recorder"]["commands_refused"])
     assert 0 < refused <= count
     lines = [line for line in log_lines(flight.path) if "refused" in line]
@@ -161,7 +161,7 @@ def test_a_full_disk_costs_the_log_and_neither_a_command_nor_its_answer(tmp_path
 
         flight.wait(came, "the command does not come")
         assert [asked.command for asked in heard] == [OperatorCommand.LAND]
-        client.ack(heard[0], True, "landing", ROWS[1000][1])
+        client.ack(heard[0], True, "landing", rows()[1000][1])
         assert listener.wait(Topic.ACK, Ack).text == "landing"
 
 

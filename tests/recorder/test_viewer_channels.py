@@ -21,7 +21,6 @@ from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
 from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rotate
 from companion.model.hanging_line import hanging_line_m
 from companion.model.markers import BallState
-from companion.model.outputs import TetherState
 from companion.model.team import BarPose, Grip, PartnerState, TeamState
 from companion.model.types import Joints, MocapPose, Quat, Vec3
 from companion.recorder.log_file import LogFile
@@ -30,6 +29,7 @@ from tests.machines import overrides_with_joints
 from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
 from tests.recorder.test_layouts import TEAM
 from tests.recorder.viewers import Seen, Viewed, at_path, split_path, view
+from tests.safety.healthy import SLOW
 from tests.support import HOVER, tether_of
 
 NAN = math.nan
@@ -227,19 +227,7 @@ def test_the_tether_is_coloured_by_its_slack(tmp_path: Path, away_m: float, held
     tether = tether_of(load_flight("configs/missions/catch.yaml").vehicle)
     x, y, z = tether.anchor_world_m
     inputs, outputs, sent = moved(still()[0], (x, y, z + away_m), (1.0, 0.0, 0.0, 0.0), (2.0, 2.0))
-    watched = TetherState(
-        range_m=away_m,
-        slack_m=3.0 - away_m,
-        stop_slack_m=0.0,
-        elevation_rad=0.0,
-        clearance_m=1.0,
-        turns=0.0,
-        pull_n=0.0,
-        taut=False,
-        snagged=held,
-        separated=False,
-        vehicle_turns=0.0,
-    )
+    watched = replace(SLOW, range_m=away_m, slack_m=3.0 - away_m, stop_slack_m=0.0, snagged=held)
     viewed = written(tmp_path / "flight.mcap", [(inputs, replace(outputs, tether=watched), sent)])
     line = only(viewed.by_topic["/scene"], "tether")["lines"][0]
     assert colour_of(line["color"]) == colour

@@ -15,7 +15,7 @@ from companion.runtime.console import FlightDisplay, console_on, print_result
 from companion.runtime.realtime import Realtime
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
-from tests.ground.monitor_stub import sent_at
+from tests.analysis.synthetic_flight import sent_at
 from tests.support import SHORT_CATCH
 
 

@@ -204,10 +204,7 @@ def bar(tilt_deg: float, *, seen_ticks: int = 1000) -> Change:
 
     def change(i: Inputs) -> Inputs:
         pose = BarPose(
-            stamp_s=i.t_s,
-            position_world_m=(0.0, 0.6, 0.9),
-            attitude_wxyz=attitude,
-            tracking_valid=i.tick < seen_ticks,
+            stamp_s=i.t_s, position_world_m=(0.0, 0.6, 0.9), attitude_wxyz=attitude, tracking_valid=i.tick < seen_ticks
         )
         return replace(i, bar=pose)
 

@@ -111,10 +111,7 @@ WEAK = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("layout", "mission", "extra"),
-    [("octa_plus", SHORT_CATCH, []), ("hexa_x", HOVER, WEAK)],
-)
+@pytest.mark.parametrize(("layout", "mission", "extra"), [("octa_plus", SHORT_CATCH, []), ("hexa_x", HOVER, WEAK)])
 def test_other_layouts_hover_with_a_weak_rotor_and_catch(layout: str, mission: Path, extra: list[str]) -> None:
     flight = FastFlight(load_sitl(mission, overrides=[f"vehicle.airframe.layout={layout}", *extra]))
     result, machine = flight.run(), flight.plant.machine

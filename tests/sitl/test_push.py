@@ -126,8 +126,7 @@ def pushed(preset: str, force_world_n: Vec3, base_rows: bool = False) -> Pushed:
     before, after = table[table[:, 0] < 0.0], table[table[:, 0] >= 0.0]
     deflection = after[:, 1:6] - before[:, 1:6].mean(axis=0)
     return Pushed(
-        Deflection(deflection[:, :3], deflection[:, 3:]),
-        ideal_deflection(config, force_world_n, after[:, 0]),
+        Deflection(deflection[:, :3], deflection[:, 3:]), ideal_deflection(config, force_world_n, after[:, 0])
     )
 
 

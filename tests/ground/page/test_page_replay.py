@@ -16,7 +16,8 @@ from companion.ground.protocol.messages import Presence, Stream
 from companion.model.codec import to_jsonable
 from companion.sitl_config.loader import load_sitl
 from tests.analysis.recorded import record
-from tests.ground.monitor_stub import Message, MonitorStub, catch_flight, flown, hello, preflight, sent_at, state
+from tests.analysis.synthetic_flight import sent_at
+from tests.ground.monitor_stub import Message, MonitorStub, catch_flight, flown, hello, preflight, state
 from tests.ground.page_browser import Page, watching
 from tests.support import CATCH, free_port, sandbox_in
 

@@ -31,8 +31,7 @@ def ends_at_m(pull: Hanging, length_m: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(
-    ("level_m", "height_m", "length_m"),
-    [(1.5, 1.0, 2.4), (1.5, 1.0, 1.9), (2.0, 2.0, 2.9), (2.0, 0.3, 2.1)],
+    ("level_m", "height_m", "length_m"), [(1.5, 1.0, 2.4), (1.5, 1.0, 1.9), (2.0, 2.0, 2.9), (2.0, 0.3, 2.1)]
 )
 def test_a_line_that_is_pulled_level_follows_the_catenary(level_m: float, height_m: float, length_m: float) -> None:
     pull = hanging(level_m, height_m, length_m, WEIGHT_N_M)
