@@ -26,12 +26,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from msgspec.structs import replace
+
 from companion.cli.main import main
 from companion.config.arm import Tool
 from companion.config.tether import Tether
 from companion.config.vehicle import Vehicle
 from companion.model.outputs import Outputs
-from companion.model.types import Inputs
+from companion.model.types import IDENTITY_QUAT, Inputs, MocapPose
 from companion.sitl_config.loader import load_sitl
 
 ROOT = Path(__file__).parents[1]
@@ -476,6 +478,15 @@ async def eventually(condition: Callable[[], bool], what: str, within_s: float =
     while not condition():
         assert time.monotonic() < deadline_s, f"not within {within_s} s: {what}"
         await asyncio.sleep(0.01)
+
+
+def level_pose(t_s: float, **changes: object) -> MocapPose:
+    """A pose of motion capture, level at 1 m, with fields replaced."""
+    pose = MocapPose(
+        stamp_s=t_s, latency_s=0.005, frame_number=1, position_world_m=(0.1, 0.2, 1.0), attitude_wxyz=IDENTITY_QUAT,
+        tracking_valid=True, marker_error_m=0.0002,
+    )  # fmt: skip
+    return replace(pose, **changes)
 
 
 def position_error_m(i: Inputs, o: Outputs) -> float:

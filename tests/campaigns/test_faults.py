@@ -17,23 +17,13 @@ from companion.cli.main import main
 from companion.launcher.launcher import FlightResult
 from companion.launcher.run import summary_of
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from companion.model.types import (
-    Event,
-    Inputs,
-    MocapPose,
-    OperatorCommand,
-    Outcome,
-    PhaseKind,
-    SafetyAction,
-    Severity,
-    Vec3,
-)
+from companion.model.types import Event, Inputs, OperatorCommand, Outcome, PhaseKind, SafetyAction, Severity, Vec3
 from companion.safety.notices import NOTICES
 from companion.safety.rules import RULES
 from companion.sitl_config.faults import CONTACT_PHASES, KINDS, PHASES
 from companion.sitl_config.loader import load_sitl
 from tests.campaigns.made_up import fault_row
-from tests.support import CATCH
+from tests.support import CATCH, level_pose
 from tools.docs.faults import outcomes_markdown
 
 VEHICLE = load_sitl(CATCH).vehicle
@@ -201,15 +191,7 @@ def test_a_flight_without_files_is_lost_with_the_reason(tmp_path: Path) -> None:
 
 
 def pose(frame: int, stamp_s: float) -> Inputs:
-    seen = MocapPose(
-        stamp_s=stamp_s,
-        latency_s=0.005,
-        frame_number=frame,
-        position_world_m=(0.0, 0.0, 1.0),
-        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
-        tracking_valid=True,
-        marker_error_m=0.0,
-    )
+    seen = level_pose(stamp_s, frame_number=frame)
     return Inputs(tick=frame, t_s=stamp_s, mocap=seen, command=OperatorCommand.NONE, recorder_dropped=0)
 
 

@@ -50,7 +50,7 @@ from companion.recorder.client import RecorderProcess
 from companion.runtime import ipc
 from companion.runtime.clock import Clock
 from tests.flight.simulated import SimulatedTime, simulated
-from tests.support import HOVER, ROOT
+from tests.support import HOVER, ROOT, level_pose
 
 ZERO = (0.0, 0.0, 0.0)
 RECORDED = MocapCounts(
@@ -167,15 +167,7 @@ class OtherMocap(Standing):
         self.frame += 1
         # No measurement is the same twice: the core would take it for a frozen stream.
         x, y, z = self.position_m
-        return MocapPose(
-            stamp_s=self.clock(),
-            latency_s=0.005,
-            frame_number=self.frame,
-            position_world_m=(x + 1e-5 * (self.frame % 7), y, z),
-            attitude_wxyz=IDENTITY_QUAT,
-            tracking_valid=True,
-            marker_error_m=0.0002,
-        )
+        return level_pose(self.clock(), frame_number=self.frame, position_world_m=(x + 1e-5 * (self.frame % 7), y, z))
 
 
 class OtherArm(Standing):

@@ -25,7 +25,6 @@ from companion.model.types import (
     Inputs,
     LandedState,
     LinkIdentity,
-    MocapPose,
     OperatorCommand,
     PhaseKind,
     SafetyAction,
@@ -33,7 +32,7 @@ from companion.model.types import (
 )
 from companion.phases.contact import force as contact
 from tests.guardian.landing_rig import beat
-from tests.support import HOVER
+from tests.support import HOVER, level_pose
 
 Pair = tuple[GuardianClient, socket.socket]
 LINK = LinkIdentity(autopilot_system=1, own_system=1, own_component=195, local_port=14540, peer=("10.0.0.7", 14580))
@@ -123,14 +122,7 @@ def test_a_guardian_that_does_not_read_never_blocks_the_flight(pair: Pair) -> No
 
 def inputs(*, armed: bool = False, tracking: bool = True) -> Inputs:
     status = AutopilotStatus(heartbeat_stamp_s=5.0, armed=armed, mode=FlightMode.OFFBOARD, landed=LandedState.IN_AIR)
-    mocap = MocapPose(
-        stamp_s=4.9,
-        frame_number=1,
-        position_world_m=(1.0, 2.0, 3.0),
-        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
-        tracking_valid=tracking,
-        marker_error_m=0.0,
-    )
+    mocap = level_pose(4.9, position_world_m=(1.0, 2.0, 3.0), tracking_valid=tracking)
     return Inputs(tick=9, t_s=5.0, status=status, mocap=mocap, command=OperatorCommand.NONE, recorder_dropped=0)
 
 

@@ -28,7 +28,7 @@ from companion.model.types import (
 from companion.runtime.clock import Clock, flight_clock
 from tests.io.px4_peer import ACCEL_FRD_M_S2, GYRO_FRD_RAD_S, POSITION_NED_M, VELOCITY_NED_M_S, Px4Peer
 from tests.io.refusal import refusal
-from tests.support import DEADLINE_S, eventually, free_udp_port
+from tests.support import DEADLINE_S, eventually, free_udp_port, level_pose
 
 LEAN_RAD = 0.2
 DO_SET_MODE, NAV_LAND, ARM_DISARM = 176, 21, 400
@@ -42,15 +42,7 @@ def edge(where: int | str, clock: Clock | None = None, *, forwarding: bool = Fal
 
 
 def pose_of(number: int, attitude_wxyz: Quat = (1.0, 0.0, 0.0, 0.0), stamp_s: float = 12.5) -> MocapPose:
-    return MocapPose(
-        stamp_s=stamp_s,
-        latency_s=0.003,
-        frame_number=number,
-        position_world_m=(1.5, -0.25, 0.75),
-        attitude_wxyz=attitude_wxyz,
-        tracking_valid=True,
-        marker_error_m=0.0,
-    )
+    return level_pose(stamp_s, frame_number=number, position_world_m=(1.5, -0.25, 0.75), attitude_wxyz=attitude_wxyz)
 
 
 @contextlib.asynccontextmanager

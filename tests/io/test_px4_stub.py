@@ -10,11 +10,11 @@ import pytest
 
 from companion.io.px4.driver import MavsdkAutopilot
 from companion.model.frames import quat_from_euler_zyx
-from companion.model.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus, MocapPose
+from companion.model.types import AttitudeSetpoint, AutopilotRequest, AutopilotStatus
 from companion.runtime.clock import Clock, flight_clock
 from tests.io.stub_rig import standing_stub
 from tests.io.test_px4 import edge
-from tests.support import eventually, free_udp_port
+from tests.support import eventually, free_udp_port, level_pose
 
 AIDED = 16 | 32 | 256
 """ESTIMATOR_POS_HORIZ_ABS, POS_VERT_ABS, PRED_POS_HORIZ_REL"""
@@ -35,15 +35,8 @@ class Companion:
         number = 0
         attitude = quat_from_euler_zyx(0.0, 0.0, YAW_RAD)
         while True:
-            pose = MocapPose(
-                stamp_s=self._clock(),
-                latency_s=0.003,
-                frame_number=number,
-                position_world_m=POSITION_WORLD_M,
-                attitude_wxyz=attitude,
-                tracking_valid=True,
-                marker_error_m=0.0,
-            )
+            now_s = self._clock()
+            pose = level_pose(now_s, frame_number=number, position_world_m=POSITION_WORLD_M, attitude_wxyz=attitude)
             assert self.autopilot.send_vision(pose)
             assert self.autopilot.send_attitude(AttitudeSetpoint(attitude, 0.1))
             self.autopilot.request(self.request)

@@ -27,7 +27,6 @@ from companion.model.types import (
     Event,
     GroundCommand,
     Inputs,
-    MocapPose,
     OperatorCommand,
     PhaseKind,
     SafetyAction,
@@ -35,7 +34,7 @@ from companion.model.types import (
 )
 from companion.recorder.client import RecorderClient, RecorderProcess, epoch_offset_ns
 from tests.analysis.synthetic_flight import sent_at
-from tests.support import DEADLINE_S
+from tests.support import DEADLINE_S, level_pose
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
@@ -46,15 +45,7 @@ def asked(command: OperatorCommand) -> GroundCommand:
 
 def tick(k: int, text: str = "") -> tuple[Inputs, Outputs, Sent]:
     t_s = k * 0.005
-    pose = MocapPose(
-        stamp_s=t_s,
-        latency_s=0.002,
-        frame_number=k,
-        position_world_m=(0.1 * k, 1 / 3, 1.0),
-        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
-        tracking_valid=True,
-        marker_error_m=1e-4,
-    )
+    pose = level_pose(t_s, frame_number=k, position_world_m=(0.1 * k, 1 / 3, 1.0))
     events = (
         (Event(t_s=t_s, id="note", severity=Severity.WARNING, action=SafetyAction.WARN, text=text),) if text else ()
     )

@@ -22,7 +22,7 @@ from companion.model.frames import quat_from_euler_zyx, quat_multiply, quat_rota
 from companion.model.hanging_line import hanging_line_m
 from companion.model.markers import BallState
 from companion.model.team import BarPose, Grip, PartnerState, TeamState
-from companion.model.types import Joints, MocapPose, Quat, Vec3
+from companion.model.types import Joints, Quat, Vec3
 from companion.recorder.log_file import LogFile
 from companion.recorder.log_writer import LogWriter
 from tests.machines import overrides_with_joints
@@ -30,7 +30,7 @@ from tests.recorder.flights import EPOCH_NS, Row, config_json, tethered
 from tests.recorder.test_layouts import TEAM
 from tests.recorder.viewers import Seen, Viewed, at_path, split_path, view
 from tests.safety.healthy import SLOW
-from tests.support import HOVER, tether_of
+from tests.support import HOVER, level_pose, tether_of
 
 NAN = math.nan
 
@@ -262,7 +262,7 @@ def test_the_hanging_line_is_as_long_as_the_tether_and_below_its_chord(end: Vec3
 
 def test_the_flown_path_stays_short_however_long_the_flight(tmp_path: Path) -> None:
     inputs, outputs, sent = still()[0]
-    seen = mocap(0.0)
+    seen = level_pose(0.0)
 
     def circling() -> Iterable[Row]:
         for k in range(600):
@@ -279,19 +279,6 @@ def test_the_flown_path_stays_short_however_long_the_flight(tmp_path: Path) -> N
     assert start == pytest.approx((1.0, 0.0, 1.0), abs=0.1), "the beginning of the flight is in it"
 
 
-def mocap(t_s: float, **changes: Any) -> MocapPose:
-    usual = MocapPose(
-        stamp_s=t_s,
-        latency_s=0.002,
-        frame_number=1,
-        position_world_m=(0.1, 0.2, 1.0),
-        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
-        tracking_valid=True,
-        marker_error_m=1e-4,
-    )
-    return replace(usual, **changes)
-
-
 @pytest.mark.parametrize(
     "changes",
     [
@@ -305,7 +292,9 @@ def mocap(t_s: float, **changes: Any) -> MocapPose:
 )
 def test_without_a_pose_of_motion_capture_px4_s_is_shown(tmp_path: Path, changes: dict[str, Any]) -> None:
     inputs, outputs, sent = moved(still()[0], (0.7, 0.8, 0.9), (1.0, 0.0, 0.0, 0.0), (2.0, 2.0))
-    viewed = written(tmp_path / "flight.mcap", [(replace(inputs, mocap=mocap(inputs.t_s, **changes)), outputs, sent)])
+    viewed = written(
+        tmp_path / "flight.mcap", [(replace(inputs, mocap=level_pose(inputs.t_s, **changes)), outputs, sent)]
+    )
     assert vec(viewed.by_topic["/tf"][0].data["translation"]) == (0.7, 0.8, 0.9)
     assert len(viewed.by_topic["/pose"]) == (1 if "stamp_s" in changes else 0), "what is no pose is not shown as one"
 
@@ -361,7 +350,7 @@ def test_a_tick_that_cannot_be_drawn_is_recorded_and_reported_once(tmp_path: Pat
     rows = still(12)
     for inputs, outputs, sent in rows:
         torn: Any = (0.0, 1.0)
-        writer.tick(replace(inputs, mocap=mocap(inputs.t_s, position_world_m=torn)), outputs, sent)
+        writer.tick(replace(inputs, mocap=level_pose(inputs.t_s, position_world_m=torn)), outputs, sent)
     writer.close()
     log_file.close()
     viewed = view(tmp_path / "flight.mcap")
