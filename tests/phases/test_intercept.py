@@ -160,10 +160,15 @@ def test_a_ball_is_found_again_after_50_ms_without_frames() -> None:
     assert all(ball_is_seen for t_s, ball_is_seen in seen.items() if t_s > 0.12)
 
 
-def test_the_net_is_where_the_plan_wants_it_if_body_and_tilt_follow_as_assumed() -> None:
+@pytest.mark.parametrize(
+    ("aside_m", "height_m", "sinks"), [(0.2, 0.75, False), (0.35, 0.42, False), (0.42, 0.41, True)]
+)
+def test_the_net_is_where_the_plan_wants_it_if_body_and_tilt_follow_as_assumed_and_sinks_only_if_it_must(
+    aside_m: float, height_m: float, sinks: bool
+) -> None:
     arrival_s, ahead_m, dt_s = 0.6, 0.2, 0.001
     now, lag, reach = State((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), Lag(), reach_of(0.35, 1.5)
-    point = ball.Point(arrival_s, (ahead_m + 0.05, -0.2, 0.75), (-3.0, 0.0, -3.0), 0.01)
+    point = ball.Point(arrival_s, (ahead_m + 0.05, -aside_m, height_m), (-3.0, 0.0, -3.0), 0.01)
     for start_s in (0.0, 0.3):  # replanned once, in motion
         (plan,) = meetings(start_s, now, lag, [point], (ahead_m, 0.0, -0.35), OPENING, BOUNDS, reach, None)
         for k in range(300):
@@ -182,6 +187,7 @@ def test_the_net_is_where_the_plan_wants_it_if_body_and_tilt_follow_as_assumed()
         z - RISES_S * now.velocity_m_s[2] - ahead_m * tilt[0] - 0.35,
     )
     assert math.dist(net_m, point.position_m) < 0.01
+    assert (now.velocity_m_s[2] < -0.01) == sinks
 
 
 def _weighed(weights: Sequence[float], values: Sequence[float]) -> float:

@@ -44,7 +44,7 @@ APART_S: Final = 0.05
 
 
 class Plan(Record, frozen=True):
-    """How the net gets to a meeting: accelerations, and the gains on the net's responses to them."""
+    """How the net gets to a meeting: the acceleration of the reference over the time that is left."""
 
     point: Point
     """The ball."""
@@ -53,7 +53,11 @@ class Plan(Record, frozen=True):
     up_m_s2: float
     """Largest vertical acceleration."""
     aside_gain: float
-    up_gain: float
+    """Gain on the net's horizontal response."""
+    up_end_m_s2: float
+    """Vertical acceleration at the meeting."""
+    up_slope_m_s3: float
+    """How much more it is, per second before the meeting."""
 
     def push_m_s2(self, t_s: float, drop_m: float) -> Vec3:
         """Return the acceleration of the reference at a time."""
@@ -61,8 +65,8 @@ class Plan(Record, frozen=True):
         if left_s <= 0.0:
             return (0.0, 0.0, 0.0)
         aside = max(-1.0, min(1.0, self.aside_gain * aside_s(left_s, drop_m)))
-        up = max(-1.0, min(1.0, self.up_gain * (left_s - RISES_S)))
-        return (self.aside_m_s2[0] * aside, self.aside_m_s2[1] * aside, self.up_m_s2 * up)
+        up_m_s2 = max(-self.up_m_s2, min(self.up_m_s2, self.up_end_m_s2 + self.up_slope_m_s3 * left_s))
+        return (self.aside_m_s2[0] * aside, self.aside_m_s2[1] * aside, up_m_s2)
 
 
 def aside_s(left_s: float, drop_m: float) -> float:
@@ -99,13 +103,23 @@ class Reach:
         number = min(len(self._aside), max(1, round(left_s / STEP_S)))
         return number, self._asides_s2[number - 1], self._ups_s2[number - 1]
 
-    def plan(self, point: Point, left_s: float, away_m: Vec3, most_m_s2: float, ahead_m: tuple[float, float]) -> Plan:
-        """Return the plan with which the net moves by `away_m`.
+    def plan(
+        self,
+        point: Point,
+        left_s: float,
+        away_m: Vec3,
+        rises_m_s: float,
+        most_m_s2: float,
+        ahead_m: tuple[float, float],
+    ) -> Plan:
+        """Return the plan with which the net moves by `away_m`, beyond what it moves by itself. It does not sink at the meeting if the
+        limit allows: a heavy ball pushes a vehicle that sinks much farther down.
 
         Args:
             point: the ball at the meeting.
             left_s: time to the meeting.
             away_m: displacement of the net.
+            rises_m_s: vertical velocity of the reference.
             most_m_s2: largest acceleration.
             ahead_m: horizontal position of the net relative to the body, world frame: if that is tilted, the net rises or falls.
         """
@@ -119,7 +133,15 @@ class Reach:
         swung_s2 = STEP_S * sum([max(-1.0, min(1.0, gain * w)) * slope for w, slope in zip(aside, tilt, strict=True)])
         z += swung_s2 * (ahead_m[0] * push[0] + ahead_m[1] * push[1])
         rise = math.copysign(max(1e-9, min(abs(z) / up_s2, math.sqrt(max(0.0, most_m_s2**2 - most**2)))), z)
-        return Plan(point, push, rise, gain, _gain(up, z / rise))
+        up_gain = _gain(up, z / rise)
+        if rises_m_s + rise * STEP_S * sum([max(-1.0, min(1.0, up_gain * w)) for w in up]) < 0.0:
+            slope = 12.0 * (z + (0.5 * left_s - RISES_S) * rises_m_s) / left_s**3
+            end = -rises_m_s / left_s - 0.5 * left_s * slope
+            peak = max(abs(end), abs(end + left_s * slope))
+            if math.hypot(peak, most * min(1.0, gain * max(map(abs, aside)))) <= most_m_s2:
+                return Plan(point, push, peak, gain, end, slope)
+        slope = rise * up_gain
+        return Plan(point, push, abs(rise), gain, -RISES_S * slope, slope)
 
 
 reach_of = functools.lru_cache(maxsize=4)(Reach)
@@ -193,6 +215,6 @@ def meetings(
     for _, point, away_m in found:
         if all(abs(point.t_s - other_s) >= APART_S for other_s in tried_s):
             tried_s.append(point.t_s)
-            yield reach.plan(point, point.t_s - t_s, away_m, most, (nx, ny))
+            yield reach.plan(point, point.t_s - t_s, away_m, vz, most, (nx, ny))
             if len(tried_s) == TRIED_MAX:
                 return
