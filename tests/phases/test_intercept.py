@@ -32,7 +32,7 @@ from companion.phases.intercept.motion import OVERSHOOT, Bounds, State
 from companion.phases.intercept.net import net_m, opening
 from companion.phases.intercept.phase import Intercept
 from companion.phases.intercept.rotors import clearance_m, places_body_m
-from companion.phases.intercept.state import Interception, Mode
+from companion.phases.intercept.state import Dodge, Interception, Mode
 from companion.safety.governor import SafeSet
 from companion.safety.notices import EventDefinition
 from companion.safety.stop import StopModel
@@ -266,11 +266,15 @@ def test_the_body_that_lags_behind_a_push_could_always_stop_in_the_room(wanted: 
         Lag(),
         StopModel(CONFIG.vehicle.safety),
     )
-    nearest_m = math.inf
+    nearest_m, braking = math.inf, None
     for tick in range(300):
         t_s = tick * TICK_PERIOD_S
         pushed = BOUNDS.pushed(t_s, now, TICK_PERIOD_S, wanted, lag)
-        now = BOUNDS.stop(t_s, now).at(t_s + TICK_PERIOD_S) if pushed is None else pushed
+        if pushed is None:
+            braking = braking or BOUNDS.stop(t_s, now)
+            now = braking.at(t_s + TICK_PERIOD_S)
+        else:
+            now, braking = pushed, None
         lag = lag.after(TICK_PERIOD_S, now.acceleration_m_s2)
         velocity = np.add(now.velocity_m_s, (*lag.body_m_s(now.acceleration_m_s2), 0.0))
         at_m = np.add(now.position_m, (*lag.body_m(), 0.0)) + velocity * stop.time_s(float(np.linalg.norm(velocity)))
@@ -426,6 +430,19 @@ def test_a_vehicle_that_waits_moves_aside_for_a_ball_that_comes_to_its_rotors_an
             for rotor in airframe.rotor_layout.positions_body_m:
                 x, y, z = place - rotor
                 assert abs(z) >= 0.035 or math.hypot(x, y) - airframe.disk_radius_m >= 0.035, "it strikes a rotor"
+
+
+@pytest.mark.parametrize("push", [(0.0, 0.0, -6.0), (0.0, 0.0, 6.0), (0.0, 6.0, 0.0), (-4.0, 4.0, -2.0)], ids=str)
+def test_a_vehicle_that_moves_aside_for_long_stays_in_its_box(push: Vec3) -> None:
+    state = replace(PHASE.begin(Tick(0.0, None, True, [])), mode=Mode.DODGE, dodge=Dodge(push, 1.0))
+    farthest = np.zeros(3)
+    for number in range(1, 400):
+        after = PHASE.step(Tick(number * TICK_PERIOD_S, None, True, []), state)
+        assert after is not None
+        state = after
+        farthest = np.maximum(farthest, np.abs(np.subtract(state.now.position_m, HOME.position_world_m)))
+        assert (farthest <= np.add(PHASE.box_m, 1e-6)).all(), f"after {number * TICK_PERIOD_S:.2f} s"
+    assert (farthest > 0.8 * np.array(PHASE.box_m)).any(), "it never comes near a side of the box"
 
 
 def test_no_ball_crosses_the_rotors_of_a_vehicle_that_tilts_and_lags_on_its_way_to_it() -> None:

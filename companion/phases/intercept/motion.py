@@ -209,10 +209,16 @@ class Bounds:
         self, t_s: float, now: State, push_m_s2: Callable[[float], Vec3], step_s: float, count: int
     ) -> list[Vec3]:
         """Return the accelerations that the limits leave of the wanted ones, in steps from now on."""
-        found = []
+        found: list[Vec3] = []
+        braking: Motion | None = None
         for k in range(count):
-            after = self.pushed(t_s + k * step_s, now, step_s, push_m_s2(t_s + (k + 0.5) * step_s))
-            now = self.stop(t_s, now).at(t_s + step_s) if after is None else after
+            begin_s = t_s + k * step_s
+            after = self.pushed(begin_s, now, step_s, push_m_s2(begin_s + 0.5 * step_s))
+            if after is not None:
+                braking, now = None, after
+            else:
+                braking = braking or self.stop(begin_s, now)
+                now = braking.at(begin_s + step_s)
             found.append(now.acceleration_m_s2)
         return found
 

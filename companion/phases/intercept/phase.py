@@ -143,9 +143,9 @@ class Intercept(Phase):
             if s.mode in PUSHED:
                 return s
         if s.motion is None:
-            motion = self._bounds(air, s).stop(air.t_s - air.dt_s, s.now)
+            motion = s.braking or self._bounds(air, s).stop(air.t_s - air.dt_s, s.now)
             now = motion.at(air.t_s)
-            return replace(s, motion=motion, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
+            return replace(s, motion=motion, braking=None, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
         if new and air.nominal:
             s = self._watched(air, s)
         if s.motion is None:  # it dodges
@@ -281,9 +281,13 @@ class Intercept(Phase):
         # A dodge is pushed as it was judged: without the lags.
         lag = s.lag if s.mode is Mode.CHASE else None
         now = bounds.pushed(air.t_s, s.now, air.dt_s, push_of(air, s)(air.t_s), lag)
-        if now is None:
-            now = bounds.stop(air.t_s - air.dt_s, s.now).at(air.t_s)
-        return replace(s, now=now, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
+        if now is not None:
+            s = replace(s, now=now, braking=None)
+        else:  # one stop is followed: one that is planned again in every tick goes too far
+            braking = s.braking or bounds.stop(air.t_s - air.dt_s, s.now)
+            now = braking.at(air.t_s)
+            s = replace(s, now=now, braking=braking)
+        return replace(s, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
 
     def _path(self, air: Air, s: Interception, candidate: Candidate) -> list[Point]:
         floor_m = self._net(air, s)[2] - self.box_m[2]

@@ -53,6 +53,8 @@ class Interception(Record, frozen=True, kw_only=True):
     """The reference's lagging acceleration."""
     motion: Motion | None = None
     """Motion that is flown; None while waiting, during a chase, and before a stop is planned."""
+    braking: Motion | None = None
+    """Stop that a chase or a dodge follows as long as the limits allow nothing else; None otherwise."""
     plan: Plan | None = None
     """Way to the meeting that was planned last."""
     dodge: Dodge | None = None
