@@ -233,6 +233,8 @@ def test_a_pilot_who_takes_over_after_touch_down_is_not_disarmed(sandbox: Sandbo
     fault = "world.faults=[{kind: pilot_takeover, t_s: 8.5, size: 3.0}]"
     ended = sandbox.run("fly", HOVER, f"--sitl={autopilot}", "--out", "out", *slow, "--set", fault)
     sandbox.assert_nobody_left()
+    if ended.code == EXIT_REFUSED and "LNDMC_TRIG_TIME" in ended.err:
+        pytest.skip("PX4 1.18 has no LNDMC_TRIG_TIME: its land detector always takes 1 s")
     assert ended.code == EXIT_ABORTED, (ended.out, ended.err)
     ids = event_ids(read_summary(sandbox.cwd / "out"))
     assert ids.index("touchdown") < ids.index("pilot_took_over")
