@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -47,24 +46,6 @@ FAST = set_options(**{PREFLIGHT: 1.0, "vehicle.ground.mqtt": None}, **SHORT)
 ENDS = ("left", "right")
 INTERFACE = "vehicle.devices.mocap.interface=127.0.0.1"
 FLY = ("team", "fly", TEAM, "--sitl", "--world", "ideal", "--speed", "max", "--out", "out", *FAST)
-
-
-SHORT_START = """
-import sys
-
-if "companion.flight.main" in sys.orig_argv:
-    import companion.model.flight_stage
-
-    companion.model.flight_stage.TARE_S = companion.model.flight_stage.STREAM_BEFORE_OFFBOARD_S = 0.1
-"""
-"""A `sitecustomize`: a flight over wires waits before its take-off for no longer than one with `short_start`. It cannot be replayed."""
-
-
-@pytest.fixture
-def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
-    (tmp_path / "sitecustomize.py").write_text(SHORT_START, encoding="utf-8")
-    with sandbox_in(tmp_path / "sandbox", hooked(tmp_path)) as sandbox:
-        yield sandbox
 
 
 @pytest.mark.parametrize(
@@ -196,19 +177,20 @@ def summary_in(out: Path) -> dict[str, Any]:
 
 
 def test_a_member_whose_flight_process_dies_is_landed_by_its_guardian_and_the_other_one_by_ctrl_c(
-    sandbox: Sandbox, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     """It dies of an error in the core. The other one hears the guardian until it ends: tests/io/test_team_link.py. Killed while they
     carry, it lands both: tests/sitl/test_pair.py.
     """
-    (tmp_path / "sitecustomize.py").write_text(SHORT_START + _RIGHT_BREAKS, encoding="utf-8")
-    with sandbox.start(*FLY, "--no-report") as running:
-        running.wait_for("the guardian has taken over")
-        running.signal(signal.SIGINT)
-        ended = running.end()
-    sandbox.assert_nobody_left()
-    summary = summary_in(sandbox.cwd / "out")
-    written = (sandbox.cwd / "out/right/flight.log").read_text(encoding="utf-8")
+    (tmp_path / "sitecustomize.py").write_text(_RIGHT_BREAKS, encoding="utf-8")
+    with sandbox_in(tmp_path / "sandbox", hooked(tmp_path)) as sandbox:
+        with sandbox.start(*FLY, "--no-report") as running:
+            running.wait_for("the guardian has taken over")
+            running.signal(signal.SIGINT)
+            ended = running.end()
+        sandbox.assert_nobody_left()
+        summary = summary_in(sandbox.cwd / "out")
+        written = (sandbox.cwd / "out/right/flight.log").read_text(encoding="utf-8")
     assert {end: member["outcome"] for end, member in summary["members"].items()} == {
         "left": "aborted",
         "right": "aborted",
@@ -221,6 +203,8 @@ def test_a_member_whose_flight_process_dies_is_landed_by_its_guardian_and_the_ot
 
 
 _RIGHT_BREAKS = """
+import sys
+
 if "companion.flight.main" in sys.orig_argv and "out/right" in " ".join(sys.orig_argv):
     import companion.core.flight_core
 
