@@ -151,14 +151,8 @@ def torque_refused(a: ArmTracker, _: None) -> Values | None:
 
 def servo_error(a: ArmTracker, _: None) -> Values | None:
     """Fires if a servo reports a hardware error."""
-    arm = a.arm
-    if arm is None:
-        return None
-    if any(arm.hardware_error):
-        for error in arm.hardware_error:
-            if error & ~WATCHDOG_ERROR:
-                return (error_text(arm.hardware_error),)
-    return None
+    text = error_text(a.arm.hardware_error) if a.arm is not None and any(a.arm.hardware_error) else ""
+    return (text,) if text else None
 
 
 def clamp_error(a: ArmTracker, _: None) -> Values | None:
@@ -168,12 +162,8 @@ def clamp_error(a: ArmTracker, _: None) -> Values | None:
 
 def servo_watchdog_tripped(a: ArmTracker, _: None) -> Values | None:
     """Fires if a servo's bus watchdog has switched the torque off."""
-    arm = a.arm
-    if arm is not None and any(arm.hardware_error):
-        for error in arm.hardware_error:
-            if error & WATCHDOG_ERROR:
-                return HOLDS
-    return None
+    errors = a.arm.hardware_error if a.arm is not None else ()
+    return HOLDS if any(errors) and any(error & WATCHDOG_ERROR for error in errors) else None
 
 
 def joint_jump(a: ArmTracker, thresholds: Vec2) -> Values | None:

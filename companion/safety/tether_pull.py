@@ -45,22 +45,6 @@ class PullEstimate:
         tether: thresholds and time constants.
     """
 
-    __slots__ = (
-        "_after_s",
-        "_ambient",
-        "_f",
-        "_filter_s",
-        "_learned_s",
-        "_min_n",
-        "_moved_m",
-        "_pull_s",
-        "_refuted",
-        "_side_s",
-        "pull_n",
-        "pulling",
-        "sideways",
-    )
-
     def __init__(self, tether: Tether) -> None:
         self._min_n = tether.pull_min_n
         self._filter_s = tether.pull_filter_s
