@@ -111,11 +111,15 @@ def _check(arguments: argparse.Namespace) -> int:
     scratch = Path(tempfile.mkdtemp(prefix="companion-check-"))
     codes = []
     try:
-        members = linked(team, scratch)
-        for end in members:
-            (scratch / end).mkdir()
-        folders = [(config, scratch / end) for end, config in members.items()]
-        worlds = SitlProcess.start_all(folders, px4=arguments.sitl == "px4")
+        try:
+            members = linked(team, scratch)
+            for end in members:
+                (scratch / end).mkdir()
+            folders = [(config, scratch / end) for end, config in members.items()]
+            worlds = SitlProcess.start_all(folders, px4=arguments.sitl == "px4")
+        except (OSError, LaunchError) as error:
+            print_error(f"companion team check: {error}")
+            return EXIT_REFUSED
         try:
             arguments.plan_only = False
             for (end, config), world in zip(members.items(), worlds, strict=True):
@@ -126,9 +130,6 @@ def _check(arguments: argparse.Namespace) -> int:
                 world.told.close()
             for world in worlds:
                 world.stop()
-    except (OSError, LaunchError) as error:
-        print_error(f"companion team check: {error}")
-        codes.append(EXIT_REFUSED)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     return max(codes)

@@ -80,7 +80,7 @@ def _problems(error: ValidationError, schema: _Node, document: Document) -> list
     problems: list[Problem] = []
     meant: set[Location] = set()
     listed: set[Location] = set()
-    kind = _another_kind(schema, document)
+    kind = another_kind(schema, document)
     if kind is not None:
         return [Problem(RANK_KEY, Origin(document.source), kind)]
     reported: set[Location] = set()
@@ -195,7 +195,7 @@ def _plural(item: str) -> str:
     return re.sub(r"^(?:a|an) ((?:whole )?number)", r"\1s", item)
 
 
-def _another_kind(schema: _Node, document: Document) -> str | None:
+def another_kind(schema: _Node, document: Document) -> str | None:
     """Return the message about a file of another kind than expected, or None."""
     known = schema.get("properties", {})
     marks = [key for key in _KINDS if key in known]

@@ -22,7 +22,7 @@ from companion.config.document import (
     key_path,
     problem_lines,
 )
-from companion.config.explain import did_you_mean, validate
+from companion.config.explain import another_kind, did_you_mean, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
 from companion.config.phase import phase_classes
@@ -255,6 +255,10 @@ def _check_controller(document: Document, overrides: list[Override], lines: list
     if isinstance(law, str) and law in LAWS:
         return validated(LAWS[law], document, lines)
     expected = f"expected one of {', '.join(LAWS)}"
+    another = another_kind({"properties": {"law": {}}}, document)
+    if another is not None:
+        lines.append(f"{document.source}: {another}")
+        return None
     if law is None:
         document.report(("law",), f"missing; {expected}", RANK_MISSING)
     else:

@@ -8,6 +8,7 @@ import math
 import os
 import random
 import signal
+import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Self
@@ -19,6 +20,7 @@ from companion.campaigns.process import Message
 from companion.campaigns.tune.draws import draws_of
 from companion.campaigns.tune.search import Evaluation, Search, rungs_of, survivors_of
 from companion.campaigns.tune.space import Point, Space
+from companion.cli.main import main
 from companion.config.controller import PRESETS, AdaptiveConfig, LawConfig
 from companion.config.loader import load_flight
 from companion.control.scaled_gains import joint_inertia_kg_m2
@@ -278,6 +280,18 @@ def test_a_full_disk_costs_no_flight_of_a_search(monkeypatch: pytest.MonkeyPatch
     assert ended.code == EXIT_LOST
     assert ended.err_lines == ["companion tune: out/flights.jsonl: cannot be written: No space left on device"]
     assert Path("out/flights.jsonl").read_bytes() == before
+
+
+@pytest.mark.usefixtures("made_up")
+def test_a_result_that_cannot_be_printed_is_written_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert main([*TUNE, "--budget", "10", "--out", "out"]) == EXIT_BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "companion tune: standard output cannot be written: No space left on device"
+    assert Path("out/result.json").exists()
 
 
 @pytest.mark.usefixtures("made_up")

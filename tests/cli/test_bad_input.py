@@ -254,7 +254,7 @@ def test_the_line_that_a_copy_of_the_files_suggests_flies_from_any_folder(
     assert shlex.split(line) == ["companion", "fly", str(tmp_path / "my files/missions/catch.yaml"), "--sitl"]
 
 
-@pytest.mark.parametrize("command", ["schema mission", "export flight.mcap --format csv"])
+@pytest.mark.parametrize("command", ["schema mission", "export flight.mcap --format csv", "team check carry --sitl"])
 def test_output_that_cannot_be_written_is_one_line(command: str, tmp_path: Path) -> None:
     if command.startswith("export"):
         pytest.importorskip("pandas")

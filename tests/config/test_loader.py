@@ -217,7 +217,7 @@ BAD_OVERRIDES = [
     ("controller.kp=[1, 2]", "--set controller.kp: unknown key; did you mean stiffness_kp?"),
     ("vehicle.tether.knot=1", "--set vehicle.tether.knot: unknown key; known keys: anchor_world_m, length_m, attachment_body_m, margin_m, load_rating_n, weight_n_per_m, turns_max, taut_slack_m, pull_min_n, pull_filter_s, pull_time_s, separation_m, rotor_inner_radius_m, clearance_min_m"),
     ("world.payload_kg=3", "--set world.payload_kg: expected a number from 0 to 2, got 3"),
-    ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of 48 names ("mocap_loss", "mocap_occluded", "mocap_jump", ...), got "mocap_los" (did you mean mocap_loss?)'),
+    ("world.faults=[{kind: mocap_los, t_s: 5}]", '--set world.faults: faults[0].kind: expected one of 49 names ("mocap_loss", "mocap_occluded", "mocap_jump", ...), got "mocap_los" (did you mean mocap_loss?)'),
     ("world.throw_velocity_m_s=[1, 2", "--set world.throw_velocity_m_s: not YAML: expected ',' or ']', but got '<stream end>' while parsing a flow sequence"),
     ("mission.phases[9].duration_s=3", "--set mission.phases[9].duration_s: mission.phases has no index 9; available: 0 to 6"),
     ("mission.name.x=3", "--set mission.name.x: mission.name has no keys; it is a single value"),
@@ -240,11 +240,13 @@ def test_bad_override(project: Path, option: str, line: str) -> None:
         ("mission", VEHICLE, f"{VEHICLE}: is a vehicle file, expected a mission file"),
         ("vehicle", CATCH, f"{CATCH}: is a mission file, expected a vehicle file"),
         ("world", CATCH, f"{CATCH}: is a mission file, expected a world file"),
+        ("controller", VEHICLE, f"{VEHICLE}: is a vehicle file, expected a controller file"),
     ],
 )
 def test_a_file_of_another_kind_is_one_problem(project: Path, role: str, name: str, line: str) -> None:
     given = {"mission": CATCH, "vehicle": VEHICLE, "world": "lab", role: name}
-    assert lines_of(lambda: load_sitl(given["mission"], given["vehicle"], world=given["world"])) == [line]
+    law = given.get("controller")
+    assert lines_of(lambda: load_sitl(given["mission"], given["vehicle"], law, world=given["world"])) == [line]
 
 
 def test_the_known_keys_of_a_mapping_are_listed_once(project: Path) -> None:

@@ -62,12 +62,8 @@ def costs_table(judged: HeldOut) -> Table:
     return table(columns, sides, title="Held-out laboratories: cost, and mean contribution of each term, m")
 
 
-def publish(result: Result, out: Path, console: Console | None) -> None:
-    """Write the files of a result into a folder and print it.
-
-    Args:
-        console: where to print; None to print JSON instead.
-    """
+def write(result: Result, out: Path) -> Path | None:
+    """Write the files of a result into a folder; return the controller file, or None if the result is no better than the start."""
     file = out / CONTROLLER_FILE if result.better else None
     (out / CONTROLLER_FILE).unlink(missing_ok=True)
     if file is not None:
@@ -87,19 +83,25 @@ def publish(result: Result, out: Path, console: Console | None) -> None:
     ]
     # This file is written last: if it exists, all the others exist.
     (out / RESULT_FILE).write_text(to_json({**data, "candidates": evaluations}), encoding="utf-8")
+    return file
+
+
+def show(result: Result, out: Path, console: Console | None, file: Path | None) -> None:
+    """Print gains, costs, and the line that flies the gains.
+
+    Args:
+        out: folder of the result's files.
+        console: where to print; None to print JSON instead.
+        file: the controller file, or None.
+    """
     if console is None:
-        sys.stdout.write(to_json(data))
+        sys.stdout.write(to_json(result.data(file)))
         sys.stdout.flush()
         return
-    show(result, console, file)
-    print_lines(console, f"report  {out / PAGE_FILE}")
-
-
-def show(result: Result, console: Console, file: Path | None) -> None:
-    """Print gains, costs, and the line that flies the gains."""
     for shown in (gains_table(result.gains), costs_table(result.judged)):
         console.print(for_terminal(shown), highlight=False)
     print_lines(console, result.verdict, *([] if file is None else [f"to fly it:  {result.fly_line(file)}"]))
+    print_lines(console, f"report  {out / PAGE_FILE}")
 
 
 def page(result: Result, pictures: Sequence[Picture]) -> Page:

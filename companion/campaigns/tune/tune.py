@@ -22,7 +22,7 @@ from companion.campaigns.process import CampaignError, Message
 from companion.campaigns.runner import Row, print_lines, to_json, versions
 from companion.campaigns.tune.draws import Draws, draws_of
 from companion.campaigns.tune.flights import Flights, Interrupted
-from companion.campaigns.tune.output import publish
+from companion.campaigns.tune.output import show, write
 from companion.campaigns.tune.result import HeldOut, Result
 from companion.campaigns.tune.search import Evaluation, Search, batches_of
 from companion.campaigns.tune.space import Point, Space
@@ -133,9 +133,7 @@ def run(tune: Tune, out: Path, console: Console | None) -> int:
             search.run(space.start_point)
             judged = _judge(search, space, held_out, flights)
         result = Result(tune.settings(), tune.command, tune.fly, space, search, training, held_out, judged)
-        publish(result, out, console)
-    except BrokenPipeError:
-        raise  # standard output has closed, which is no failure
+        file = write(result, out)
     except OSError as error:
         print_error(f"companion tune: {error.filename or out}: cannot be written: {error.strerror}")
         return EXIT_LOST
@@ -145,6 +143,7 @@ def run(tune: Tune, out: Path, console: Console | None) -> int:
     except CampaignError as error:
         print_error(f"companion tune: {error}")
         return error.exit_code
+    show(result, out, console, file)
     return EXIT_OK if result.better else EXIT_REFUSED
 
 
