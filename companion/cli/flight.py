@@ -15,11 +15,13 @@ from typing import Any
 from companion.cli.options import (
     MISSION_HELP,
     MISSION_OR_DEFAULT_HELP,
+    Shorthand,
     add_law,
     add_overrides,
     add_seed,
     add_sitl,
     add_world,
+    refuse_contradictions,
     time_stamp,
 )
 from companion.cli.schema import schema_json
@@ -165,12 +167,15 @@ def _fly(arguments: argparse.Namespace) -> int:
     speed = speed_of(arguments)
     if arguments.mqtt is not None:
         off, url = arguments.mqtt == "off", json.dumps(arguments.mqtt)
-        arguments.overrides += ["vehicle.ground.mqtt=null" if off else f"vehicle.ground.mqtt.url={url}"]
+        key, value = ("vehicle.ground.mqtt", "null") if off else ("vehicle.ground.mqtt.url", url)
+        arguments.overrides += [Shorthand.of("--mqtt", key, value, arguments.mqtt)]
     for key in ("qgroundcontrol", "foxglove"):
         if getattr(arguments, key) is not None:
-            arguments.overrides += [f"vehicle.ground.{key}={json.dumps(getattr(arguments, key))}"]
+            value = getattr(arguments, key)
+            arguments.overrides += [Shorthand.of(f"--{key}", f"vehicle.ground.{key}", json.dumps(value), value)]
     if arguments.wait_for_start:
-        arguments.overrides += ["mission.start.takeoff=by_operator"]
+        arguments.overrides += [Shorthand.of("--wait-for-start", "mission.start.takeoff", "by_operator", "")]
+    refuse_contradictions(arguments)
     config = _load(arguments, hardware=arguments.sitl is None, real_px4=arguments.sitl == "px4")
     problems = _no_server(config) or [
         *check_mission(config.mission, config.vehicle, phase_origins=config.sources.phases),

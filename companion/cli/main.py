@@ -87,6 +87,10 @@ def _run(words: list[str]) -> int:
         print_error(missing)
         return EXIT_REFUSED
     try:
+        if hasattr(arguments, "overrides"):
+            from companion.cli.options import refuse_contradictions
+
+            refuse_contradictions(arguments)
         code: int = arguments.run(arguments)
         sys.stdout.flush()
     except (ConfigError, PluginError) as error:

@@ -4,15 +4,70 @@ from __future__ import annotations
 
 import argparse
 import datetime
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Final, Self
 
 from companion.config.controller import PRESETS
+from companion.config.document import ConfigError
 from companion.config.shipped import DEFAULT_MISSION, names
 from companion.plugins import PluginError
 from companion.sitl_config.loader import COMMAND_LINE_WORLD, WORLDS
 
 MISSION_HELP = f"mission: a built-in name ({', '.join(names('missions'))}) or a file"
 MISSION_OR_DEFAULT_HELP = f"{MISSION_HELP} (default: {DEFAULT_MISSION})"
+
+_FILES: Final = {
+    "vehicle": ("mission.vehicle",),
+    "controller": ("mission.controller.law", "mission.controller.file"),
+    "preset": ("mission.controller.preset",),
+}
+"""Options that replace what the mission file says, with its keys."""
+
+_QUOTES: Final = "\"'"
+
+
+class Shorthand(str):
+    """An override that an option other than `--set` gives."""
+
+    option = ""
+    """The option with its value."""
+
+    @classmethod
+    def of(cls, option: str, key: str, value: str, shown: str | None = None) -> Self:
+        """Return the override of a key by an option.
+
+        Args:
+            shown: the value as it is given, if that is another text.
+        """
+        override = cls(f"{key}={value}")
+        override.option = f"{option} {value if shown is None else shown}".strip()
+        return override
+
+
+def refuse_contradictions(arguments: argparse.Namespace) -> None:
+    """Refuse an option and a `--set` that give one setting different values; raises ConfigError."""
+    overrides = getattr(arguments, "overrides", None) or ()
+    for short in (*overrides, *_of_files(arguments)):
+        if not isinstance(short, Shorthand):
+            continue
+        key, _, value = short.partition("=")
+        for other in overrides:
+            name, _, wanted = (text.strip() for text in other.partition("="))
+            inside = any(long.startswith((f"{part}.", f"{part}[")) for long, part in ((name, key), (key, name)))
+            if inside or (name == key and wanted.strip(_QUOTES) != value.strip(_QUOTES)):
+                text = other.option if isinstance(other, Shorthand) else f"--set {other}"
+                raise ConfigError(
+                    f"companion {arguments.command}: {short.option} and {text} give one setting different values; "
+                    "leave one of them out"
+                )
+
+
+def _of_files(arguments: argparse.Namespace) -> Iterator[Shorthand]:
+    for name, keys in _FILES.items():
+        value = getattr(arguments, name, None)
+        if isinstance(value, str):
+            for key in keys:
+                yield Shorthand.of(f"--{name}", key, value)
 
 
 def time_stamp() -> str:
@@ -90,4 +145,4 @@ def add_seed(parser: argparse.ArgumentParser) -> None:
 
 
 def _seed_override(text: str) -> str:
-    return f"world.seed={whole(0, 999_999_999)(text)}"
+    return Shorthand.of("--seed", "world.seed", str(whole(0, 999_999_999)(text)))

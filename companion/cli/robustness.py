@@ -10,7 +10,7 @@ from companion.campaigns.pair import PairRobustness
 from companion.campaigns.robustness.campaign import Robustness
 from companion.campaigns.robustness.cases import Case, Cases, read_cases
 from companion.cli.campaign import add_options, add_plan, checked, common, count, fly, refuse_beside, why_unusable
-from companion.cli.options import MISSION_OR_DEFAULT_HELP, whole
+from companion.cli.options import MISSION_OR_DEFAULT_HELP, Shorthand, whole
 from companion.config.document import ConfigError
 from companion.config.shipped import DEFAULT_MISSION, names
 from companion.mission.check import check_mission
@@ -52,7 +52,7 @@ def add_parser(commands: Any) -> None:
 
 
 def _model_error_override(text: str) -> str:
-    return f"world.model_error={text}"
+    return Shorthand.of("--model-error", "world.model_error", text)
 
 
 def run(arguments: argparse.Namespace) -> int:

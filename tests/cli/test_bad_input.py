@@ -254,6 +254,40 @@ def test_the_line_that_a_copy_of_the_files_suggests_flies_from_any_folder(
     assert shlex.split(line) == ["companion", "fly", str(tmp_path / "my files/missions/catch.yaml"), "--sitl"]
 
 
+@pytest.mark.parametrize(
+    ("words", "first", "second"),
+    [
+        ("fly catch --sitl --seed 1 --set world.seed=2", "--seed 1", "--set world.seed=2"),
+        ("fly catch --sitl --seed 1 --seed 2", "--seed 1", "--seed 2"),
+        ("fly catch --mqtt off --set vehicle.ground.mqtt.url=mqtt://h", "--mqtt off", "--set vehicle.ground.mqtt.url=mqtt://h"),
+        ("fly catch --wait-for-start --set mission.start.takeoff=auto", "--wait-for-start", "--set mission.start.takeoff=auto"),
+        ("check catch --vehicle hexa_2r --set mission.vehicle=hexa", "--vehicle hexa_2r", "--set mission.vehicle=hexa"),
+        ("check catch --preset paper --set mission.controller={law:csc}", "--preset paper", "--set mission.controller={law:csc}"),
+        ("robustness catch --controller csc --set mission.controller.law=psc", "--controller csc", "--set mission.controller.law=psc"),
+        ("robustness catch --model-error 0.1 --set world.model_error=0.2", "--model-error 0.1", "--set world.model_error=0.2"),
+        ("team check carry --seed 1 --set world.seed=2", "--seed 1", "--set world.seed=2"),
+    ],
+)  # fmt: skip
+def test_two_values_of_one_setting_are_refused(
+    words: str,
+    first: str,
+    second: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words.split()) == EXIT_BAD_INPUT
+    (line,) = capsys.readouterr().err.splitlines()
+    text = f"{first} and {second} give one setting different values; leave one of them out"
+    assert line == f"companion {words.split()[0]}: {text}"
+
+
+def test_an_option_and_a_set_of_the_same_value_are_accepted() -> None:
+    same = ["--seed", "1", "--set", "world.seed=1", "--vehicle", "hexa_2r", "--set", "mission.vehicle=hexa_2r"]
+    assert main(["check", "hover", "--plan-only", *same]) == EXIT_OK
+
+
 @pytest.mark.parametrize("command", ["schema mission", "export flight.mcap --format csv", "team check carry --sitl"])
 def test_output_that_cannot_be_written_is_one_line(command: str, tmp_path: Path) -> None:
     if command.startswith("export"):
