@@ -28,7 +28,7 @@ from companion.ground.protocol.keys import operators_text, write_private
 from companion.ground.protocol.messages import Presence, TetherView
 from companion.ground.protocol.proof import with_proofs
 from companion.ground.station.station import Station
-from companion.ground.station.text_monitor import APART_S, CONFIRM_S, _Screen
+from companion.ground.station.text_monitor import APART_S, CONFIRM_S, KEYS, _Screen
 from companion.ground.station.text_view import STALE_S, Notice, StationStatus, render, stale, status_line, status_word
 from companion.ground.station.vehicles import Vehicle, VehicleTracker
 from companion.model.codec import to_json
@@ -246,9 +246,20 @@ def test_a_held_key_gives_no_command_that_needs_confirmation(
     access = broker_access("mqtt://127.0.0.1", None, None)
     station = Station(access, SIGNER, None, lambda heard: None, lambda connected, text: None)
     screen = _Screen(Console())
+    payload = to_json(with_proofs(replace(flight()[1][-1], session="s1", wall_s=1e9), "rig", [ANNA.key]))
+    assert station.tracker.receive("companion/rig/stream", payload, False, now_s) is not None
     for repeat_s in (0.0, delay_s, *[0.033] * 300, 0.5, 1.0):  # and let go, pressed again
         now_s += repeat_s
         assert screen._command(key, station) is None
+
+
+@pytest.mark.parametrize("key", "sl")
+def test_without_a_vehicle_a_key_is_answered_and_asks_for_no_confirmation(key: str) -> None:
+    station = Station(broker_access("mqtt://127.0.0.1", None, None), SIGNER, None, lambda _: None, lambda *_: None)
+    screen = _Screen(Console())
+    assert screen._command(key, station) is None
+    (notice,) = screen._notices
+    assert notice.text == f"{KEYS[key].value}: not sent, because no vehicle is heard"
 
 
 async def test_it_shows_commands_and_leaves_the_terminal_as_it_was(broker: Broker, tmp_path: Path) -> None:

@@ -121,11 +121,14 @@ class _Screen:
             names = sorted(station.tracker.vehicles)
             if self._chosen in names:
                 self._chosen = names[(names.index(self._chosen) + 1) % len(names)]
-        command = KEYS.get(key)
+        command, vehicle = KEYS.get(key), self._vehicle(station)
         unconfirmed, self._unconfirmed = self._unconfirmed, None
+        if command is not None and vehicle is None:
+            self._notices.append(Notice(f"{command.value}: not sent, because no vehicle is heard", "bold yellow"))
+            return None
         if command in SAFER_COMMANDS:
             return command
-        now_s, target = time.monotonic(), _target(self._vehicle(station))
+        now_s, target = time.monotonic(), _target(vehicle)
         if command is not None:
             self._unconfirmed = (command, now_s, target)
             text = f"{command.value}? press {CONFIRM_KEY} after {APART_S:g} to {CONFIRM_S:g} s"
