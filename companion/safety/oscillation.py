@@ -44,12 +44,15 @@ class Swings:
 
     def __init__(self, swing_m: float) -> None:
         self._swing_m = swing_m
-        self._extreme_m, self._rises = 0.0, True
+        self._extreme_m: float | None = None
+        self._rises = True
         self.turned_s: deque[float] = deque((-math.inf,) * TURNS, maxlen=TURNS)
         """Times of the newest turning points, oldest first."""
 
     def update(self, t_s: float, error_m: float) -> None:
         """Update with the error of one tick."""
+        if self._extreme_m is None:  # after a chase the error does not begin at 0
+            self._extreme_m = error_m
         beyond_m = error_m - self._extreme_m if self._rises else self._extreme_m - error_m
         if beyond_m > 0.0:
             self._extreme_m = error_m

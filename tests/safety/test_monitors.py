@@ -362,6 +362,15 @@ def test_fast_swings_move_the_vehicle_little_and_are_an_oscillation_if_they_tilt
     assert not any(found[:200]), "not before two periods, of 0.8 s each"
 
 
+def test_an_error_that_is_there_from_the_start_is_no_turning_point() -> None:
+    """As after a chase: up, down, up and down again are three turning points, and not a fourth one at 0."""
+    watch, found = Oscillation(SWING_M), []
+    for k in range(290):
+        watch.update(k * TICK_S, TICK_S, (0.0, -0.6 * SWING_M * math.cos(8.0 * k * TICK_S)), (0.9, 0.0))
+        found.append(watch.rate_rad_s is not None)
+    assert not any(found)
+
+
 @pytest.mark.parametrize("chases", [True, False])
 def test_swings_that_a_chase_causes_are_not_counted(chases: bool) -> None:
     context = swinging()
