@@ -111,7 +111,7 @@ class Safety(Model):
     tracking_error_abort_m: Positive = 0.8
     oscillation_m: Positive = 0.10
     """Horizontal distance between two turning points of the position error from which a swing counts; four of them within 6 s are an
-    oscillation, and PX4 lands. If the vehicle tilts twice as fast, 0.4 of it counts, within 3 s."""
+    oscillation, and PX4 lands."""
     thrust_saturated_s: Positive = 1.0
     """Largest difference between the time at the upper thrust limit and the time below it."""
     speed_max_m_s: Positive = 2.0

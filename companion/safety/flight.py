@@ -116,7 +116,7 @@ def tilt(f: FlightTracker, tilt_max_rad: float) -> Values | None:
 def oscillates(f: FlightTracker, _: None) -> Values | None:
     """Fires if the position error and the tilt oscillate."""
     rate_rad_s = f.oscillation.rate_rad_s
-    return None if rate_rad_s is None else (f.oscillation.swing_m, math.degrees(rate_rad_s))
+    return None if rate_rad_s is None else (f.oscillation_m, math.degrees(rate_rad_s))
 
 
 def crashed(f: FlightTracker, _: None) -> Values | None:

@@ -1,7 +1,5 @@
 """Detects that the closed loop oscillates: the position error swings to and fro while the tilt follows it. Pure.
 
-Slow swings are large. Fast ones move the vehicle little and tilt it much: 17 deg of tilt within 6 cm, at 1.3 Hz.
-
 A loop with too much delay, or with a gain that is too high, swings about its reference, however small the mean error is. A blow, a gust
 or a new reference displaces the vehicle once, and the error dies out within a swing or two.
 """
@@ -10,25 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import Final, NamedTuple
+from typing import Final
 
 TURNS: Final = 4
-"""Number of turning points within the window: two whole periods."""
-
-
-class Kind(NamedTuple):
-    """What counts as one kind of oscillation."""
-
-    share: float
-    """Smallest distance between two turning points, as a share of `safety.oscillation_m`."""
-    window_s: float
-    """Time within which the turning points must lie."""
-    rate_rad_s: float
-    """Smallest tilt rate (RMS) of an oscillation that the rotors drive. Vibration of a gyroscope alone reaches 0.2."""
-
-
-KINDS: Final = (Kind(share=1.0, window_s=6.0, rate_rad_s=0.3), Kind(share=0.4, window_s=3.0, rate_rad_s=0.6))
-"""Slow and fast. 6 s are three periods of the slowest limit cycle in docs/internals/safety.md, 2 s."""
+"""Number of turning points within `WINDOW_S`: two whole periods."""
+WINDOW_S: Final = 6.0
+"""Three periods of the slowest limit cycle in docs/internals/safety.md, 2 s."""
+RATE_RAD_S: Final = 0.3
+"""Tilt rate (RMS) of an oscillation that the rotors drive. Vibration of a gyroscope alone reaches 0.2."""
 RATE_TIME_S: Final = 1.0
 """Time constant of the mean square of the tilt rate."""
 
@@ -44,15 +31,12 @@ class Swings:
 
     def __init__(self, swing_m: float) -> None:
         self._swing_m = swing_m
-        self._extreme_m: float | None = None
-        self._rises = True
+        self._extreme_m, self._rises = 0.0, True
         self.turned_s: deque[float] = deque((-math.inf,) * TURNS, maxlen=TURNS)
         """Times of the newest turning points, oldest first."""
 
     def update(self, t_s: float, error_m: float) -> None:
         """Update with the error of one tick."""
-        if self._extreme_m is None:  # after a chase the error does not begin at 0
-            self._extreme_m = error_m
         beyond_m = error_m - self._extreme_m if self._rises else self._extreme_m - error_m
         if beyond_m > 0.0:
             self._extreme_m = error_m
@@ -65,15 +49,12 @@ class Oscillation:
     """Watches the horizontal position error and the tilt rate.
 
     Args:
-        swing_m: distance between two turning points of a slow swing, `safety.oscillation_m`.
+        swing_m: distance between two turning points that counts as a swing, `safety.oscillation_m`.
     """
 
     def __init__(self, swing_m: float) -> None:
-        self._kinds = [(kind, kind.share * swing_m) for kind in KINDS]
-        self._swings = [(Swings(least_m), Swings(least_m)) for _, least_m in self._kinds]
+        self._x, self._y = Swings(swing_m), Swings(swing_m)
         self._rate_2 = 0.0
-        self.swing_m = swing_m
-        """Distance between two turning points that the swings exceed while the vehicle oscillates."""
         self.rate_rad_s: float | None = None
         """Tilt rate (RMS) while the vehicle oscillates; else None."""
 
@@ -88,10 +69,8 @@ class Oscillation:
         """
         p, q = rate_rad_s
         self._rate_2 += dt_s / (RATE_TIME_S + dt_s) * (p * p + q * q - self._rate_2)
-        self.rate_rad_s = None
-        for (kind, least_m), (x, y) in zip(self._kinds, self._swings, strict=True):
-            x.update(t_s, error_m[0])
-            y.update(t_s, error_m[1])
-            lasts = t_s - max(x.turned_s[0], y.turned_s[0]) <= kind.window_s
-            if lasts and self.rate_rad_s is None and self._rate_2 > kind.rate_rad_s * kind.rate_rad_s:
-                self.swing_m, self.rate_rad_s = least_m, math.sqrt(self._rate_2)
+        self._x.update(t_s, error_m[0])
+        self._y.update(t_s, error_m[1])
+        begun_s = max(self._x.turned_s[0], self._y.turned_s[0])
+        found = t_s - begun_s <= WINDOW_S and self._rate_2 > RATE_RAD_S * RATE_RAD_S
+        self.rate_rad_s = math.sqrt(self._rate_2) if found else None

@@ -346,31 +346,6 @@ def test_only_swings_that_last_are_an_oscillation(
     assert not any(found[:400]), "not before two periods, of 2.1 s each"
 
 
-@pytest.mark.parametrize(
-    ("swing_m", "rate_rad_s", "oscillates"),
-    [(0.05, 0.8, True), (0.05, 0.55, False), (0.035, 0.8, False)],
-    ids=["fast", "a-blow-tilts-it", "noise-of-motion-capture"],
-)
-def test_fast_swings_move_the_vehicle_little_and_are_an_oscillation_if_they_tilt_it_much(
-    swing_m: float, rate_rad_s: float, oscillates: bool
-) -> None:
-    watch, found = Oscillation(SWING_M), []
-    for k in range(1000):
-        watch.update(k * TICK_S, TICK_S, (0.0, 0.5 * swing_m * math.sin(8.0 * k * TICK_S)), (rate_rad_s, 0.0))
-        found.append(watch.rate_rad_s is not None)
-    assert any(found) is oscillates
-    assert not any(found[:200]), "not before two periods, of 0.8 s each"
-
-
-def test_an_error_that_is_there_from_the_start_is_no_turning_point() -> None:
-    """As after a chase: up, down, up and down again are three turning points, and not a fourth one at 0."""
-    watch, found = Oscillation(SWING_M), []
-    for k in range(290):
-        watch.update(k * TICK_S, TICK_S, (0.0, -0.6 * SWING_M * math.cos(8.0 * k * TICK_S)), (0.9, 0.0))
-        found.append(watch.rate_rad_s is not None)
-    assert not any(found)
-
-
 @pytest.mark.parametrize("chases", [True, False])
 def test_swings_that_a_chase_causes_are_not_counted(chases: bool) -> None:
     context = swinging()

@@ -121,6 +121,7 @@ def test_faults_that_are_over_leave_the_world_as_it_was() -> None:
 _FOR_GOOD = (
     "autopilot_reboot",
     "servo_overload",
+    "clamp_overload",
     "payload_double",
     "payload_dropped",
     "payload_heavy",

@@ -114,6 +114,7 @@ ELSEWHERE_FLOWN = {
     "payload_missed": "test_throws.py: the miss has the size of the fault",
     "payload_double": "test_faults.py: both payloads hang in the net",
     "payload_dropped": "test_faults.py: it is felt no more",
+    "clamp_overload": "test_pair.py: the one who has a clamp lands, and both set the bar down",
 }
 """Kinds of faults, for most of which a flight to the catch is needed, whose effect is measured elsewhere."""
 UNTIL_S = 7.3
