@@ -101,6 +101,13 @@ class SafeSet:
         """Return whether the point is inside both the ball and the box."""
         return self.holds_within(p, self.radius_m, self.high_m[2])
 
+    def holds_all(self, low: Vec3, high: Vec3) -> bool:
+        """Return whether each point between two opposite corners is inside both the ball and the box."""
+        (x, y, z), (ax, ay, az) = low, self.anchor_m
+        u, v, w = high
+        farthest = (u if u - ax > ax - x else x, v if v - ay > ay - y else y, w if w - az > az - z else z)
+        return self.holds(low) and self.holds(high) and self.holds(farthest)
+
     def holds_within(self, p: Vec3, radius_m: float, top_m: float) -> bool:
         """Return whether the point is within this distance of the anchor and inside the box with this ceiling."""
         x_low, y_low, z_low = self._least_m

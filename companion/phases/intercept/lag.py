@@ -54,11 +54,13 @@ class Lag(Record, frozen=True):
 
 
 def _lagging(values: tuple[float, ...], followed: float, dt_s: float) -> tuple[float, ...]:
-    found = []
-    for value in values:
-        followed = value + dt_s / LAG_S * (followed - value)
-        found.append(followed)
-    return tuple(found)
+    share = dt_s / LAG_S
+    a, b, c, d, e = values
+    a += share * (followed - a)
+    b += share * (a - b)
+    c += share * (b - c)
+    d += share * (c - d)
+    return a, b, c, d, e + share * (d - e)
 
 
 def _weighed_rate(values: tuple[float, ...], followed: float) -> float:

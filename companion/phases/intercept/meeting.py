@@ -187,7 +187,7 @@ def meetings(
         kept_s: time of the meeting that was planned before, which is kept unless another one is clearly better; None for a first plan.
     """
     found: list[tuple[float, Point, Vec3]] = []
-    most = bounds.acceleration_m_s2
+    most, least_s = bounds.acceleration_m_s2, LEAST_S if kept_s is None else FROZEN_S
     (x, y, z), (vx, vy, vz), (nx, ny, nz), (ox, oy, oz) = now.position_m, now.velocity_m_s, net_m, opening
     swings = [body - reach.drop_m * tilt for body, tilt in zip(BODY_S2, TILT_S2_M, strict=True)]
     left_x, left_y = fading(lag.x_m_s2, swings), fading(lag.y_m_s2, swings)
@@ -196,9 +196,10 @@ def meetings(
     ]
     for point in path:
         h, (bx, by, bz), (ux, uy, uz) = point.t_s - t_s, point.position_m, point.velocity_m_s
+        if h < least_s or not bounds.in_box((bx - nx, by - ny, bz - nz)):
+            continue
         facing = -(ox * ux + oy * uy + oz * uz) / math.hypot(ux, uy, uz)
-        early = h >= (LEAST_S if kept_s is None else FROZEN_S)
-        if not early or facing < FACING or not bounds.in_box((bx - nx, by - ny, bz - nz)):
+        if facing < FACING:
             continue
         dx = bx - nx - x - h * vx - faded(left_x, h)
         dy = by - ny - y - h * vy - faded(left_y, h)

@@ -12,7 +12,7 @@ coefficients, so a motion whose few coefficients respect the limits respects the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from companion.config.mission import Limits
@@ -147,44 +147,45 @@ class Bounds:
             m: the motion.
             lag: lagging acceleration at its start; None to allow for `OVERSHOOT` instead.
         """
-        h = m.duration_s / PIECES
-        for k in range(PIECES):
-            begin, b, c = m.at(m.start_s + k * h), _plus(m.beta, m.alpha, k * h), m.alpha
-            piece = Motion(m.start_s, h, begin, c, b, begin.jerk_m_s3)
-            if not self._admits_piece(piece, OVERSHOOT if lag is None else 1.0):
-                return False
-        return lag is None or self._can_stop(m, lag)
+        overshoot = OVERSHOOT if lag is None else 1.0
+        # If the coefficients of the whole respect the limits, so do those of its pieces.
+        within = self._admits_piece(m, overshoot) or all(self._admits_piece(piece, overshoot) for piece in _pieces(m))
+        return within and (lag is None or self._can_stop(m, lag))
 
     def _can_stop(self, m: Motion, lag: Lag) -> bool:
         """Return whether the body that lags behind a motion could stop within the safe set at all times."""
         for k in range(LOOKS):
             s = m.at(m.start_s + k * LOOK_S)
             lag = lag.after(LOOK_S, s.acceleration_m_s2) if k else lag
-            (x, y), (vx, vy) = lag.body_m(), lag.body_m_s(s.acceleration_m_s2)
-            v = _plus(s.velocity_m_s, (vx, vy, (OVERSHOOT - 1.0) * s.velocity_m_s[2]), 1.0)
-            if not self._safe.holds(_plus(_plus(s.position_m, (x, y, 0.0), 1.0), v, self._stop.time_s(math.hypot(*v)))):
+            (x, y), (u, w), (px, py, pz) = lag.body_m(), lag.body_m_s(s.acceleration_m_s2), s.position_m
+            vx, vy, vz = s.velocity_m_s
+            vx, vy, vz = vx + u, vy + w, vz + (OVERSHOOT - 1.0) * vz
+            stop_s = self._stop.time_s(math.hypot(vx, vy, vz))
+            if not self._safe.holds((px + x + stop_s * vx, py + y + stop_s * vy, pz + stop_s * vz)):
                 return False
         return True
 
     def _admits_piece(self, m: Motion, overshoot: float) -> bool:
         """Return whether the Bernstein coefficients of a motion respect every limit."""
-        h = m.duration_s
-        jerks = [m.gamma, _plus(m.gamma, m.beta, 0.5 * h), _plus(_plus(m.gamma, m.beta, h), m.alpha, 0.5 * h * h)]
-        pushes = _integrated(m.begin.acceleration_m_s2, jerks, h / 3.0)
-        if not all(math.hypot(*a) <= self.acceleration_m_s2 and self._can_push(a) for a in pushes):
+        h, s = m.duration_s, m.begin
+        axes = zip(s.position_m, s.velocity_m_s, s.acceleration_m_s2, m.gamma, m.beta, m.alpha, strict=True)
+        (xs, vxs, axs, jxs), (ys, vys, ays, jys), (zs, vzs, azs, jzs) = [_coefficients(h, *axis) for axis in axes]
+        most = self.acceleration_m_s2
+        for a in zip(axs, ays, azs, strict=True):
+            if math.hypot(*a) > most or not self._can_push(a):
+                return False
+        fastest = max(map(math.hypot, vxs, vys, vzs))
+        if fastest > self.speed_m_s or max(map(math.hypot, jxs, jys, jzs)) > self._jerk_m_s3:
             return False
-        speeds = _integrated(m.begin.velocity_m_s, pushes, h / 4.0)
-        fastest = max([math.hypot(*v) for v in speeds])
-        if fastest > self.speed_m_s or not all(math.hypot(*j) <= self._jerk_m_s3 for j in jerks):
-            return False
-        places = _integrated(m.begin.position_m, speeds, h / 5.0)
-        # The velocity in the coefficients of degree 5.
-        raised = [_plus(scaled(speeds[max(0, k - 1)], 0.2 * k), speeds[min(4, k)], 1.0 - 0.2 * k) for k in range(6)]
         stop_s, safe = overshoot * self._stop.time_s(overshoot * fastest), self._safe
-        return all(
-            self.in_box(p) and safe.holds(p) and safe.holds(_plus(p, v, stop_s))
-            for p, v in zip(places, raised, strict=True)
-        )
+        (x, y, z), (bx, by, bz) = self._home_m, self._box_m
+        if max(xs) - x > bx or x - min(xs) > bx or max(ys) - y > by or y - min(ys) > by:
+            return False
+        if max(zs) - z > bz or z - min(zs) > bz:
+            return False
+        xs, ys, zs = xs + _stops(xs, vxs, stop_s), ys + _stops(ys, vys, stop_s), zs + _stops(zs, vzs, stop_s)
+        low, high = (min(xs), min(ys), min(zs)), (max(xs), max(ys), max(zs))
+        return safe.holds_all(low, high) or all(map(safe.holds, zip(xs, ys, zs, strict=True)))
 
     def _can_push(self, a: Vec3) -> bool:
         """Return whether tilt and thrust allow an acceleration."""
@@ -246,12 +247,44 @@ class Bounds:
         return motion_to(t_s, begin, duration_s, None)
 
 
-def _integrated(first: Vec3, rates: list[Vec3], h: float) -> list[Vec3]:
+def _pieces(m: Motion) -> Iterator[Motion]:
+    h = m.duration_s / PIECES
+    for k in range(PIECES):
+        begin = m.at(m.start_s + k * h)
+        yield Motion(m.start_s, h, begin, m.alpha, _plus(m.beta, m.alpha, k * h), begin.jerk_m_s3)
+
+
+def _coefficients(
+    h: float, p: float, v: float, a: float, gamma: float, beta: float, alpha: float
+) -> tuple[list[float], list[float], list[float], list[float]]:
+    """Return the Bernstein coefficients of position, velocity, acceleration and jerk along one axis."""
+    jerks = [gamma, gamma + 0.5 * h * beta, gamma + h * beta + 0.5 * h * h * alpha]
+    pushes = _integrated(a, jerks, h / 3.0)
+    speeds = _integrated(v, pushes, h / 4.0)
+    return _integrated(p, speeds, h / 5.0), speeds, pushes, jerks
+
+
+def _integrated(first: float, rates: list[float], h: float) -> list[float]:
     """Return the Bernstein coefficients of an integral from those of the integrand, with `h` the duration divided by the degree."""
     sums = [first]
     for rate in rates:
-        sums.append(_plus(sums[-1], rate, h))
+        first += h * rate
+        sums.append(first)
     return sums
+
+
+def _stops(places: list[float], speeds: list[float], stop_s: float) -> list[float]:
+    """Return the coefficients of the places that a velocity brings a motion to in a time: first, the velocity in those of degree 5."""
+    a, b, c, d, e = speeds
+    raised = (
+        a,
+        0.2 * a + 0.8 * b,
+        0.4 * b + 0.6 * c,
+        0.6 * c + 0.4 * d,
+        0.8 * d + 0.2 * e,
+        e,
+    )
+    return [place + stop_s * speed for place, speed in zip(places, raised, strict=True)]
 
 
 def _plus(a: Vec3, b: Vec3, k: float) -> Vec3:

@@ -191,7 +191,7 @@ class Intercept(Phase):
         if met is None or not balls:
             return BallState(position_world_m=balls[0].position_m) if balls else None
         at_m, end_s = met.position_m, met.t_s
-        chased = min(balls, key=lambda c: math.dist(ball.predicted(c, end_s, self.drag_per_m).position_m, at_m))
+        chased = balls[0] if len(balls) == 1 else min(balls, key=lambda c: self._astray_m(c, met))
         return BallState(position_world_m=chased.position_m, meeting_world_m=at_m, meeting_s=end_s, sigma_m=met.sigma_m)
 
     def _waited(self, air: Air, s: Interception, new: bool) -> Interception | None:
@@ -241,19 +241,14 @@ class Intercept(Phase):
         if not air.nominal:
             air.report(BALL_LOST, "a rule has warned: no ball is met any more; stopping")
             return replace(s, mode=Mode.STOP)
-        balls = [
-            (math.dist(ball.predicted(c, point.t_s, self.drag_per_m).position_m, point.position_m), n)
-            for n, c in enumerate(s.candidates)
-            if c.is_ball
-        ]
-        at_m, number = min(balls, default=(math.inf, 0))
-        left_s = point.t_s - air.t_s
-        if not balls or (new and left_s >= FROZEN_S and at_m > ASTRAY_M):
+        balls, left_s = [c for c in s.candidates if c.is_ball], point.t_s - air.t_s
+        if balls and (not new or left_s < FROZEN_S):
+            return s
+        at_m, number = min([(self._astray_m(c, point), n) for n, c in enumerate(balls)], default=(math.inf, 0))
+        if at_m > ASTRAY_M:
             air.report(BALL_LOST, "the ball that was to be met is lost; stopping")
             return replace(s, mode=Mode.STOP)
-        if not new or left_s < FROZEN_S:
-            return s
-        path = self._path(air, s, s.candidates[number])
+        path = self._path(air, s, balls[number])
         plan = self._meeting(air, s, path, point.t_s) or self._meeting(air, s, path, None)
         if plan is not None:
             return _planned(s, plan, plan.point.t_s - air.t_s)
@@ -288,6 +283,10 @@ class Intercept(Phase):
             now = braking.at(air.t_s)
             s = replace(s, now=now, braking=braking)
         return replace(s, lag=s.lag.after(air.dt_s, now.acceleration_m_s2))
+
+    def _astray_m(self, candidate: Candidate, met: Point) -> float:
+        """Return the distance from a meeting point at which a ball passes at that time."""
+        return math.dist(ball.predicted(candidate, met.t_s, self.drag_per_m).position_m, met.position_m)
 
     def _path(self, air: Air, s: Interception, candidate: Candidate) -> list[Point]:
         floor_m = self._net(air, s)[2] - self.box_m[2]

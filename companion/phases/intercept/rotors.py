@@ -43,8 +43,9 @@ def clearance_m(airframe: Airframe, places_body_m: Iterable[Vec3]) -> float:
         for share in SHARES:
             ball_x, ball_y, ball_z = x + share * (to_x - x), y + share * (to_y - y), z + share * (to_z - z)
             for rotor_x, rotor_y, rotor_z in rotors:
-                beside_m = math.hypot(ball_x - rotor_x, ball_y - rotor_y) - disk_m
-                least_m = min(least_m, max(beside_m, abs(ball_z - rotor_z)))
+                if (above_m := abs(ball_z - rotor_z)) < least_m:
+                    beside_m = math.hypot(ball_x - rotor_x, ball_y - rotor_y) - disk_m
+                    least_m = min(least_m, max(beside_m, above_m))
     return least_m
 
 
@@ -84,7 +85,8 @@ def places_body_m(
             a = push_m_s2(point.t_s)
             v = (v[0] + h * a[0], v[1] + h * a[1], v[2] + h * a[2])
             t_s, p, lag = point.t_s, (p[0] + h * v[0], p[1] + h * v[1], p[2] + h * v[2]), lag.after(h, a)
-        x, y, z = (b - o - m for b, o, m in zip(point.position_m, _body_m(p, lag), beside, strict=True))
+        (x, y, z), (u, w), (mx, my, mz) = point.position_m, lag.body_m(), beside
+        x, y, z = x - (p[0] + u) - mx, y - (p[1] + w) - my, z - p[2] - mz
         slope_x, slope_y = _slopes(lag, a)
         nx, ny = slope_x + lean_x, slope_y + lean_y
         nz = 1.0 / math.hypot(nx, ny, 1.0)
