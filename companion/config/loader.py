@@ -25,7 +25,7 @@ from companion.config.document import (
 from companion.config.explain import another_kind, did_you_mean, validate
 from companion.config.mission import ControllerChoice, Mission
 from companion.config.overrides import Override, Section, apply_overrides, parse_overrides
-from companion.config.phase import phase_classes
+from companion.config.phase import usable_class
 from companion.config.shipped import named_file, names, near
 from companion.config.urdf import read_urdf
 from companion.config.vehicle import Vehicle
@@ -222,7 +222,7 @@ def _rename_phase_keys(document: Document) -> None:
     phases = document.data.get("phases")
     for index, phase in enumerate(phases if isinstance(phases, list) else ()):
         if isinstance(phase, dict) and isinstance(name := phase.get("type"), str):
-            for old, new in getattr(phase_classes().get(name), "renamed", {}).items():
+            for old, new in getattr(usable_class(name), "renamed", {}).items():
                 document.rename(("phases", index), old, new)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import BeforeValidator, Field, GetJsonSchemaHandler, SerializeAsAny
@@ -67,32 +68,35 @@ def phase_class(name: str) -> Any:
     return found
 
 
+def usable_class(name: str) -> Any | None:
+    """Return the class of a type of phase; None if it is not installed or cannot be used."""
+    try:
+        return phase_class(name)
+    except plugins.PluginError:  # `companion plugins` and a mission that names it report it
+        return None
+
+
 @functools.cache
 def phase_classes() -> dict[str, Any]:
     """Return the classes of the installed types that can be used, by type."""
-    found = {}
-    for name in plugins.installed(plugins.PHASES):
-        try:
-            found[name] = phase_class(name)
-        except plugins.PluginError:
-            continue  # `companion plugins` and a mission that names it report it
-    return found
+    usable = {name: usable_class(name) for name in plugins.installed(plugins.PHASES)}
+    return {name: found for name, found in usable.items() if found is not None}
 
 
-@functools.cache
-def _schema() -> CoreSchema:
-    choices = {name: found.__pydantic_core_schema__ for name, found in phase_classes().items()}
+def _schema(classes: Mapping[str, Any]) -> CoreSchema:
+    choices = {name: found.__pydantic_core_schema__ for name, found in classes.items()}
     return core_schema.tagged_union_schema(choices, discriminator="type")
 
 
 @functools.cache
-def _validator() -> SchemaValidator:
-    return SchemaValidator(_schema())
+def _validator(name: str | None) -> SchemaValidator:
+    """Return the validator of one type, so that no other one is imported; of all installed types if `name` is None."""
+    return SchemaValidator(_schema(phase_classes() if name is None else {name: phase_class(name)}))
 
 
 def forget_phases() -> None:
     """Forget the installed types of phases, for tests that install some."""
-    for cached in (phase_class, phase_classes, _schema, _validator):
+    for cached in (phase_class, phase_classes, _validator):
         cached.cache_clear()
 
 
@@ -100,19 +104,19 @@ def _of_its_type(value: Any) -> Any:
     if isinstance(value, PhaseSettings):
         return value
     name = value.get("type") if isinstance(value, dict) else None
-    if isinstance(name, str) and name in plugins.installed(plugins.PHASES) and name not in phase_classes():
-        try:
-            phase_class(name)
-        except plugins.PluginError as error:
-            raise PydanticCustomError("condition", "{text}", {"text": str(error)}) from None
-    return _validator().validate_json(json.dumps(value), strict=True)
+    known = isinstance(name, str) and name in plugins.installed(plugins.PHASES)
+    try:
+        validator = _validator(name if known else None)
+    except plugins.PluginError as error:
+        raise PydanticCustomError("condition", "{text}", {"text": str(error)}) from None
+    return validator.validate_json(json.dumps(value), strict=True)
 
 
 class _AnyType:
     """Annotation with the JSON Schema of a phase: that of any installed type."""
 
     def __get_pydantic_json_schema__(self, _: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return handler(_schema())
+        return handler(_schema(phase_classes()))
 
 
 AnyPhase = Annotated[SerializeAsAny[PhaseSettings], BeforeValidator(_of_its_type), _AnyType()]
