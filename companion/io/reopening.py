@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable
 from typing import Final, Generic, Protocol, TypeVar
@@ -33,10 +34,13 @@ class Reopening(Generic[T]):
         self._ended = threading.Event()
         self._lock = threading.Lock()
         self._device: T | None = None
-        threading.Thread(target=self._run, name=name, daemon=True).start()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._start()
 
     def take(self) -> T | None:
         """Return the open device, once, or None before it is open. Never waits for it."""
+        if self._thread.ident is None:
+            self._start()
         with self._lock:
             device, self._device = self._device, None
         return device
@@ -48,6 +52,10 @@ class Reopening(Generic[T]):
         device = self.take()
         if device is not None:
             device.close()
+
+    def _start(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the process can start no thread now; `take` tries again
+            self._thread.start()
 
     def _run(self) -> None:
         while not self._ended.wait(REOPEN_PERIOD_S):

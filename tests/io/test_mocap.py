@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import logging
+import resource
 import socket
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, closing
@@ -17,6 +18,7 @@ import pytest
 
 from companion.config.devices import MocapDevice
 from companion.io.mocap import natnet
+from companion.io.mocap.client import FRAMES_SILENCE_S
 from companion.io.mocap.driver import MocapDriver
 from companion.io.mocap.natnet import Message
 from companion.io.protocols import Mocap
@@ -159,7 +161,8 @@ async def test_two_listeners_share_the_multicast_port() -> None:
             assert guardian.latest() is not None
 
 
-async def test_a_socket_that_has_lost_its_multicast_group_joins_it_again() -> None:
+@pytest.mark.parametrize("descriptors", [True, False], ids=["at once", "once a file descriptor is free"])
+async def test_a_socket_that_has_lost_its_multicast_group_joins_it_again(descriptors: bool) -> None:
     """As after a USB network adapter was unplugged and plugged in again: the kernel forgets its groups."""
     inbox = Inbox()
     async with (
@@ -171,6 +174,15 @@ async def test_a_socket_that_has_lost_its_multicast_group_joins_it_again() -> No
         edge.client.extended.sockets[-1].setsockopt(socket.IPPROTO_IP, IP_DROP_SOURCE_MEMBERSHIP, member)
         edge.client.poses()  # those that arrived before
         inbox.clear()
+        if not descriptors:
+            limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+            resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+            try:
+                await asyncio.sleep(2.0 * FRAMES_SILENCE_S)
+                assert edge.client.problem is None, "it is not the server's fault"
+                assert not inbox.queue.qsize()
+            finally:
+                resource.setrlimit(resource.RLIMIT_NOFILE, limits)
         await inbox.next()
 
 

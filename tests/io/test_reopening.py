@@ -7,6 +7,8 @@ import os
 import threading
 from collections.abc import Callable
 
+import pytest
+
 from companion.io.reopening import Reopening
 from tests.support import DEADLINE_S, wait_until
 
@@ -55,6 +57,23 @@ def test_a_device_that_opens_after_the_end_is_closed() -> None:
     port.there.set()
     wait_until(lambda: port.closed, lambda: "left open")
     assert reopening.take() is None
+
+
+def test_it_is_attempted_once_the_process_can_start_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The control tick starts the thread when a device is lost, and must not end."""
+
+    def no_thread(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    port = Port()
+    port.there.set()
+    with monkeypatch.context() as limited:
+        limited.setattr(threading.Thread, "start", no_thread)
+        reopening = Reopening("port", port.open)
+        assert reopening.take() is None
+    found: list[Port | None] = []
+    wait_until(taken(reopening, found), lambda: "not open")
+    assert found[-1] is port
 
 
 def taken(reopening: Reopening[Port], found: list[Port | None]) -> Callable[[], bool]:

@@ -130,8 +130,11 @@ class OptiTrack(ExtendedClient):
             self._sent_s = now_s
             self._send(protocol.requests(now_s))
         if self._settings.transport == "multicast" and protocol.is_silent(now_s) and not self._joining.is_alive():
-            self._joining = threading.Thread(target=self._join_again, args=(self.sockets[-1].dup(),), daemon=True)
-            self._joining.start()
+            with contextlib.suppress(
+                OSError, RuntimeError
+            ):  # no descriptor or thread is left; the next call tries again
+                self._joining = threading.Thread(target=self._join_again, args=(self.sockets[-1].dup(),), daemon=True)
+                self._joining.start()
 
     def poses(self, now_s: float) -> list[MocapPose]:
         """Return the body's poses that have arrived, in order, stamped with their arrival."""
