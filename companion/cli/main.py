@@ -46,6 +46,9 @@ class _Parser(argparse.ArgumentParser):
         sys.stderr.write(f"{self.prog}: {message}; see {self.prog} --help\n")
         sys.exit(EXIT_BAD_INPUT)
 
+    def _print_message(self, message: str, file: Any = None) -> None:
+        print(message, end="", file=file or sys.stderr, flush=True)  # argparse ignores what cannot be written
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of `companion`."""
@@ -68,13 +71,35 @@ def _run(words: list[str]) -> int:
     Args:
         words: the command line after `_normalised`.
     """
+    code = 0
+    try:
+        code = _run_command(words)
+        sys.stdout.flush()
+        from companion.runtime.console import SteadyStream
+
+        SteadyStream.raise_full()
+    except OSError as error:
+        from companion.model.exit_codes import EXIT_BAD_INPUT
+        from companion.runtime.console import FULL, SteadyStream, print_error
+
+        if error.errno not in (errno.EPIPE, *FULL) or error.filename is not None:
+            raise
+        SteadyStream(sys.stdout).discard()
+        if error.errno == errno.EPIPE:
+            return code
+        print_error(f"{' '.join(['companion', *words[:1]])}: standard output cannot be written: {error.strerror}")
+        return code or EXIT_BAD_INPUT
+    return code
+
+
+def _run_command(words: list[str]) -> int:
     arguments, unknown = make_parser(words[:1]).parse_known_args(words)
     # Imported here, because printing the version needs none of it.
     from companion.config.document import ConfigError
     from companion.install.extras import missing_extra
-    from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK, EXIT_REFUSED
+    from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_REFUSED
     from companion.plugins import PluginError
-    from companion.runtime.console import SteadyStream, print_error
+    from companion.runtime.console import print_error
 
     if unknown:
         print_error(
@@ -92,18 +117,9 @@ def _run(words: list[str]) -> int:
 
             refuse_contradictions(arguments)
         code: int = arguments.run(arguments)
-        sys.stdout.flush()
     except (ConfigError, PluginError) as error:
         for line in error.lines if isinstance(error, ConfigError) else (error,):
             print_error(line)
-        return EXIT_BAD_INPUT
-    except OSError as error:
-        if error.errno not in (errno.EPIPE, errno.ENOSPC) or error.filename is not None:
-            raise
-        SteadyStream(sys.stdout).discard()
-        if error.errno == errno.EPIPE:
-            return EXIT_OK
-        print_error(f"companion {arguments.command}: standard output cannot be written: {error.strerror}")
         return EXIT_BAD_INPUT
     return code
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any, TextIO, cast
+from typing import IO, Any, ClassVar, Final, TextIO, cast
 
 from rich.console import Console
 from rich.markup import escape
@@ -35,27 +36,45 @@ from companion.model.launcher_messages import (
 from companion.model.negative_zero import without_negative_zero
 from companion.model.types import SafetyAction, Severity
 
+FULL: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of a disk, quota or file that takes no more text."""
+
 
 class SteadyStream:
-    """A text stream that never fails: if its reader has gone (a closed pipe, a terminal that hung up), it discards all text."""
+    """A text stream that never fails: it discards all text once its reader has gone (a closed pipe, a terminal that hung up)."""
+
+    _full: ClassVar[OSError | None] = None
+    """Error of a full disk on standard output."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
+
+    @staticmethod
+    def raise_full() -> None:
+        """Raise the error of a disk that was too full for text on standard output, once; do nothing if there was none."""
+        error, SteadyStream._full = SteadyStream._full, None
+        if error is not None:
+            raise error
 
     def write(self, text: str) -> int:
         """Write the text, or discard it if the reader has gone."""
         try:
             return self._stream.write(text)
-        except OSError:
-            self.discard()
+        except OSError as error:
+            self._fail(error)
             return len(text)
 
     def flush(self) -> None:
         """Flush the stream, if its reader is still there."""
         try:
             self._stream.flush()
-        except OSError:
-            self.discard()
+        except OSError as error:
+            self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        if error.errno in FULL and self._stream is sys.stdout:
+            SteadyStream._full = error
+        self.discard()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)

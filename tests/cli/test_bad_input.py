@@ -288,15 +288,26 @@ def test_an_option_and_a_set_of_the_same_value_are_accepted() -> None:
     assert main(["check", "hover", "--plan-only", *same]) == EXIT_OK
 
 
-@pytest.mark.parametrize("command", ["schema mission", "export flight.mcap --format csv", "team check carry --sitl"])
-def test_output_that_cannot_be_written_is_one_line(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("command", "unbuffered"),
+    [
+        ("schema mission", "1"),
+        ("export flight.mcap --format csv", "1"),
+        ("team check carry --sitl", "1"),
+        ("faults --list", "1"),
+        ("faults --list", ""),
+        ("fly --help", "1"),
+        ("fly --help", ""),
+    ],
+)
+def test_output_that_cannot_be_written_is_one_line(command: str, unbuffered: str, tmp_path: Path) -> None:
     if command.startswith("export"):
         pytest.importorskip("pandas")
         record_flight(tmp_path / "flight.mcap", end_s=1.0)
     with open("/dev/full", "w") as full:
         ended = subprocess.run(
-            [sys.executable, "-P", "-u", "-m", "companion", *command.split()],
-            stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
+            [sys.executable, "-P", "-m", "companion", *command.split()],
+            stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
         )  # fmt: skip
     name = command.partition(" ")[0]
     assert ended.returncode == EXIT_BAD_INPUT
