@@ -37,6 +37,7 @@ from companion.model.types import Event, Severity, Vec3
 from companion.runtime import ipc, simulated_time
 from companion.runtime.clock import monotonic
 from companion.runtime.realtime import GUARDIAN_PRIORITY, claim_realtime
+from companion.safety.pose_filter import PoseFilter
 
 PERIOD_S = 0.01
 MOCAP_FRESH_S = 0.5
@@ -63,6 +64,8 @@ class Guardian:
         """None until it is open, and if another program feeds PX4, which then needs no poses from the guardian."""
         self._team: TeamSender | None = None
         """Sends this vehicle's state to the other of a team, once the flight process is dead; None for a vehicle that flies alone."""
+        self._pose_filter = PoseFilter(settings.pose_limits)
+        """Judges the poses of the landing; in standby it learns the motion-capture server's clock."""
         self._problem: str | None = None
         self._status_s = float("-inf")
         self._errors: set[str] = set()
@@ -111,7 +114,8 @@ class Guardian:
             last = self._heartbeats.last
             if self._mocap is not None:
                 self._mocap.keep_connected()
-                self._mocap.poses()
+                for pose in self._mocap.poses(0.0 if last is None else last.origin_s):
+                    self._pose_filter.latency_s(pose)
             if last is not None and last.goodbye:
                 return "the flight process has ended its flight, and PX4 may be armed" if last.lifting else None
             lifting = last is not None and last.lifting
@@ -227,7 +231,7 @@ class Guardian:
             last,
             self._settings.clearance_m,
             self._settings.tilt_max_rad,
-            self._settings.pose_limits,
+            self._pose_filter,
             link,
             monotonic() - last.origin_s,
             lambda notice: self._publish(last, notice),

@@ -30,7 +30,7 @@ from companion.model.types import (
     Severity,
 )
 from companion.safety.autopilot_landing import TIMEOUT_S, AutopilotLanding, LandingStep
-from companion.safety.pose_filter import PoseFilter, PoseLimits
+from companion.safety.pose_filter import PoseFilter
 
 HEARTBEAT_PERIOD_S = 1.0
 ASK_PERIOD_S = 0.1
@@ -80,7 +80,7 @@ class TakeoverLanding:
         last_heartbeat: newest heartbeat of the flight process.
         clearance_m: height of the body's origin when the vehicle rests on the ground.
         tilt_max_rad: `safety.tilt_abort_deg`, in rad.
-        pose_limits: limits of a pose that is sent to PX4.
+        pose_filter: judges the poses that are sent to PX4; its newest trusted pose becomes that of the heartbeat.
         link: an open link.
         t_s: current flight clock.
         notify: called with each notice.
@@ -92,7 +92,7 @@ class TakeoverLanding:
         last_heartbeat: Heartbeat,
         clearance_m: float,
         tilt_max_rad: float,
-        pose_limits: PoseLimits,
+        pose_filter: PoseFilter,
         link: Link,
         t_s: float,
         notify: Notify,
@@ -105,7 +105,8 @@ class TakeoverLanding:
         self._link = link
         self._notify = notify
         self._px4 = Px4State()
-        self._pose_filter = PoseFilter(pose_limits, _last_pose(last_heartbeat))
+        self._pose_filter = pose_filter
+        pose_filter.trusted = pose_filter.tracked = _last_pose(last_heartbeat)
         self._start_s = t_s
         self._spoken_s: float | None = None
         self._pilot = last_heartbeat.pilot

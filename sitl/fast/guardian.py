@@ -21,6 +21,7 @@ from companion.guardian.takeover_landing import Notify, TakeoverLanding, notice
 from companion.model.outputs import Outputs
 from companion.model.types import Event, Inputs, LinkIdentity, MocapPose, Severity
 from companion.safety.mocap import limits_of
+from companion.safety.pose_filter import PoseFilter
 from sitl.autopilot.autopilot import Px4Stub
 from sitl.autopilot.receive import Receiver
 from sitl.autopilot.streams import Schedule
@@ -167,7 +168,7 @@ class Landing:
             beat,
             clearance_m,
             tilt_max_rad,
-            limits_of(vehicle.safety),
+            PoseFilter(limits_of(vehicle.safety)),
             self._link,
             t_s,
             notify,

@@ -15,6 +15,7 @@ from companion.guardian.takeover_landing import TakeoverLanding
 from companion.model.frames import attitude_ned_frd_from_enu_flu, quat_from_euler_zyx
 from companion.model.types import Event, MocapPose, Quat, Vec3
 from companion.safety.mocap import limits_of
+from companion.safety.pose_filter import PoseFilter
 
 STANDING_M, TILT_MAX_RAD = 0.3, math.radians(40.0)
 START_S, STEP_S = 20.0, 0.01
@@ -85,7 +86,9 @@ class Landing:
         self.notices: list[Event] = []
         self.t_s = START_S
         link = Link(self.wire, (1, 191), 1)
-        self.takeover = TakeoverLanding(last, STANDING_M, TILT_MAX_RAD, LIMITS, link, START_S, self.notices.append)
+        self.takeover = TakeoverLanding(
+            last, STANDING_M, TILT_MAX_RAD, PoseFilter(LIMITS), link, START_S, self.notices.append
+        )
 
     def run(
         self,

@@ -21,6 +21,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.config.loader import load_flight
 from companion.guardian import heartbeat
 from companion.guardian.heartbeat import Heartbeat
+from companion.io.mocap.natnet import Message as NatNetMessage
 from companion.io.team_link import TeamSettings
 from companion.launcher.launcher import replace_device_settings
 from companion.model.codec import from_packet
@@ -58,10 +59,22 @@ sys.stdin.read()
 """Holds PX4's port as the flight process does, and does nothing else: the test sends the heartbeats."""
 
 
+class EchoLess(NatNetServer):
+    """A server that answers no echo request: its clients know its clock from its frames only."""
+
+    def _reply(self, message: NatNetMessage, payload: bytes, address: tuple[str, int]) -> None:
+        if message != NatNetMessage.ECHO_RESPONSE:
+            super()._reply(message, payload, address)
+
+
 class Cameras:
     """A NatNet server (unicast) that streams one body at rest at 100 Hz, in a thread."""
 
-    def __init__(self, body_id: int) -> None:
+    def __init__(self, body_id: int, server: type[NatNetServer] = NatNetServer) -> None:
+        self._server = server
+        self.held_s = 0.0
+        """Time for which the network holds each frame."""
+        self.frames = 0
         self.position_m: Vec3 = POSITION_M
         self.attitude: Quat = ATTITUDE
         self.tracked = True
@@ -81,14 +94,15 @@ class Cameras:
         self._thread.join(DEADLINE_S)
 
     async def _serve(self) -> None:
-        async with NatNetServer(bodies=((self._body_id, "companion"),)) as server:
+        async with self._server(bodies=((self._body_id, "companion"),)) as server:
             self.port = server.command_port
             self._started.set()
             while not self._stop.is_set():
-                now_s = monotonic()
+                now_s = monotonic() - self.held_s
                 x, y, z = self.position_m
                 noisy = (x, y, z + 1e-6 * (server.frame_number % 5))  # no measurement is the same twice
                 server.publish(now_s, (BodyPose(self._body_id, noisy, self.attitude, self.tracked),), now_s)
+                self.frames += 1
                 await asyncio.sleep(0.01)
 
 
@@ -103,7 +117,9 @@ class Rig:
         disk_full: bool = False,
         address: str | None = None,
         team: TeamSettings | None = None,
+        server: type[NatNetServer] = NatNetServer,
     ) -> None:
+        self._server = server
         self._team = team
         self.partner_session = 0
         """What the flight process knows of the other vehicle of a team."""
@@ -125,7 +141,7 @@ class Rig:
     def __enter__(self) -> Self:
         config = load_flight(HOVER)
         body = config.vehicle.devices.mocap.rigid_body_id
-        self.cameras = Cameras(body).__enter__()
+        self.cameras = Cameras(body, self._server).__enter__()
         devices: dict[str, dict[str, Any]] = {
             "autopilot": {"address": self._address or f"udpin://127.0.0.1:{self.port}"},
             "mocap": {

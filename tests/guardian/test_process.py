@@ -21,7 +21,7 @@ from companion.launcher.guardian_process import outcome_of
 from companion.model.frames import attitude_enu_flu_from_ned_frd, ned_from_enu, wrap_rad
 from companion.model.launcher_messages import FlightEvent, GuardianEnded, TookOver
 from companion.model.types import Outcome
-from tests.guardian.rig import DISARMED, HOLD_MODE, LAND_MODE, OWN_IDS, POSITION_M, Rig
+from tests.guardian.rig import DISARMED, HOLD_MODE, LAND_MODE, OWN_IDS, POSITION_M, EchoLess, Rig
 from tests.support import DEADLINE_S, wait_until
 
 NAV_LAND, ARM_DISARM = mavlink.MAV_CMD_NAV_LAND, mavlink.MAV_CMD_COMPONENT_ARM_DISARM
@@ -142,6 +142,20 @@ def test_poses_go_on_as_the_flight_sent_them(tmp_path: Path) -> None:
         stamps_s = [p.usec * 1e-6 for p in poses]
         assert stamps_s == sorted(stamps_s)
         assert 10.0 < stamps_s[0] < 10.0 + DEADLINE_S, "on the flight clock, which was 10 s old"
+
+
+def test_poses_that_are_late_from_the_takeover_on_are_not_sent(tmp_path: Path) -> None:
+    """The server answers no echo request: only the poses before the takeover show its clock."""
+    with Rig(tmp_path, server=EchoLess) as rig:
+        rig.beat_until_ready()
+        rig.cameras.held_s, held = 0.3, rig.cameras.frames + 2
+        wait_until(lambda: rig.cameras.frames >= held, rig.log.read_text)
+        rig.beat()
+        rig.flight.kill()
+        wait_until(lambda: "guardian_mocap" in rig.events, rig.log.read_text)
+        assert not rig.peer.of("VISION_POSITION_ESTIMATE")
+        rig.cameras.held_s = 0.0
+        rig.peer.wait_for("VISION_POSITION_ESTIMATE", 20)
 
 
 def test_land_is_commanded_until_px4_lands(tmp_path: Path) -> None:
@@ -311,10 +325,10 @@ _BUGS = """
 import sys
 
 if "companion.guardian" in sys.orig_argv:
+    import companion.guardian.process as process
     import companion.guardian.takeover_landing as takeover_landing
-    import companion.guardian.mocap as mocap
 
-    class Breaking(takeover_landing.{broken}):
+    class Breaking({module}.{broken}):
         def {method}(self, *arguments):
             Breaking.calls += 1
             if {when}:
@@ -322,26 +336,28 @@ if "companion.guardian" in sys.orig_argv:
             return super().{method}(*arguments)
 
     Breaking.calls = 0
-    takeover_landing.{broken} = Breaking
+    {module}.{broken} = Breaking
 """
 
 
 @pytest.mark.parametrize(
-    ("broken", "method", "when", "where"),
+    ("module", "broken", "method", "when", "where"),
     [
-        ("AutopilotLanding", "step", "Breaking.calls == 5", "the landing"),
-        ("AutopilotLanding", "step", "True", "the landing"),
-        ("Px4State", "take", "arguments[1].get_type() != 'HEARTBEAT'", "PX4's messages"),
-        ("PoseFilter", "check", "Breaking.calls < 50", "motion capture"),
+        ("takeover_landing", "AutopilotLanding", "step", "Breaking.calls == 5", "the landing"),
+        ("takeover_landing", "AutopilotLanding", "step", "True", "the landing"),
+        ("takeover_landing", "Px4State", "take", "arguments[1].get_type() != 'HEARTBEAT'", "PX4's messages"),
+        ("process", "PoseFilter", "check", "Breaking.calls < 50", "motion capture"),
     ],
     ids=["once", "always", "messages", "poses"],
 )
 def test_an_error_of_its_own_is_reported_and_the_landing_goes_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str, method: str, when: str, where: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, broken: str, method: str, when: str, where: str
 ) -> None:
     hooks = tmp_path / "hooks"
     hooks.mkdir()
-    (hooks / "sitecustomize.py").write_text(_BUGS.format(broken=broken, method=method, when=when), encoding="utf-8")
+    (hooks / "sitecustomize.py").write_text(
+        _BUGS.format(module=module, broken=broken, method=method, when=when), encoding="utf-8"
+    )
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(hooks), os.environ.get("PYTHONPATH")))))
     with Rig(tmp_path) as rig:
         rig.beat_until_ready()

@@ -370,6 +370,28 @@ def test_it_judges_each_pose_as_the_flight_process_does(bad: dict[str, Any]) -> 
     }
 
 
+@pytest.mark.parametrize(
+    ("delays_s", "sent"),
+    [
+        ((0.001, 0.15, 0.001, 0.15), (True, False, True, False)),
+        ((0.15, 0.001, 0.15, 0.001), (True, True, False, True)),
+    ],
+    ids=["first in time", "first late"],
+)
+def test_delays_are_measured_against_the_shortest_of_a_server_that_was_never_seen(
+    delays_s: tuple[float, ...], sent: tuple[bool, ...]
+) -> None:
+    """As after a restart of the server: its clock is any, and the latency in a frame ends at the transmission."""
+    landing = Landing(beat())
+    landing.run(0.3)
+    for delay_s, passes in zip(delays_s, sent, strict=True):
+        landing.run(0.01, mocap=False)
+        before, pose = len(landing.wire.poses), pose_at(landing.t_s)
+        sent_server_s = 5000.0 + landing.t_s - delay_s
+        landing.takeover.take_poses([replace(pose, exposure_server_s=sent_server_s - 0.005)])
+        assert len(landing.wire.poses) == before + passes
+
+
 def test_a_repeated_pose_is_not_sent() -> None:
     landing = Landing(beat())
     landing.run(0.3)
