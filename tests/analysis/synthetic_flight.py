@@ -284,8 +284,13 @@ def record_flight(
 ) -> RecorderReport:
     """Write a synthetic flight through the real recorder process."""
     config_json = "" if config is None else json.dumps(config)
+    return record_rows(path, synthetic_flight(end_s=end_s, rate_hz=rate_hz), config_json)
+
+
+def record_rows(path: Path, rows: Iterable[tuple[Inputs, Outputs, Sent]], config_json: str) -> RecorderReport:
+    """Write ticks through the real recorder process."""
     recorder = RecorderProcess.start(path, config_json=config_json, epoch_offset_ns=1_700_000_000_000_000_000)
-    for inputs, outputs, sent in synthetic_flight(end_s=end_s, rate_hz=rate_hz):
+    for inputs, outputs, sent in rows:
         # Faster than real time the channel would drop, as it must in flight; here every tick matters.
         select.select([], [recorder.client], [], 60.0)
         recorder.client.record(inputs, outputs, sent)
