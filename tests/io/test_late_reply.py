@@ -11,6 +11,7 @@ from companion.io.dynamixel import registers as dxl
 from companion.io.dynamixel.bus import ArmBus
 from sitl.servo.bus import ServoLine
 from sitl.servo.model import ServoModel
+from sitl.servo.protocol import status
 from tests.fuzz.dynamixel import IDS, WIDE, MemoryPort, MemorySerial
 from tests.io.arm_rig import arm_config
 
@@ -27,17 +28,17 @@ class LateSerial(MemorySerial):
         self.exchanges = itertools.count()
         self._late_exchange = late_exchange
         self._free_s = 0.0
-        self._coming: list[tuple[float, bytes]] = []
+        self.coming: list[tuple[float, bytes]] = []
 
     def write(self, sent: list[int] | bytes) -> int:
         held_up_s = HELD_UP_S if next(self.exchanges) == self._late_exchange else 0.0
         self._free_s = max(self._free_s, self.now_s + held_up_s) + REPLY_S
-        self._coming.append((self._free_s, self.answer(bytes(sent))))
+        self.coming.append((self._free_s, self.answer(bytes(sent))))
         return len(sent)
 
     def read(self, size: int) -> bytes:
-        while self._coming and self._coming[0][0] <= self.now_s:
-            self._waiting += self._coming.pop(0)[1]
+        while self.coming and self.coming[0][0] <= self.now_s:
+            self._waiting += self.coming.pop(0)[1]
         return super().read(size)
 
 
@@ -48,8 +49,10 @@ def servos() -> ServoLine:
     return ServoLine(models)
 
 
-def opened(late_exchange: int) -> tuple[ArmBus, LateSerial]:
+def opened(late_exchange: int, earlier: bytes = b"") -> tuple[ArmBus, LateSerial]:
+    """Open the bus; `earlier` arrives between the first request and its reply."""
     line = LateSerial(late_exchange)
+    line.coming.append((0.5 * REPLY_S, earlier))
     line.answer = servos().feed
     bus = ArmBus(ArmDevice(port="memory"), arm_config(*WIDE), aborted=lambda: False)
     bus._port = bus._servos.port = MemoryPort(line)
@@ -68,3 +71,19 @@ def test_a_late_reply_is_not_taken_for_the_reply_to_the_next_request(late_exchan
     assert bus.reports == SET_UP_REPORTS
     assert [report.current_limit_counts for report in bus.reports] == [900, 1000]
     assert EXCHANGES <= next(line.exchanges) <= EXCHANGES + 1
+
+
+@pytest.mark.parametrize("data", [b"", bytes(range(dxl.BLOCK_SIZE))], ids=["a write", "a read in flight"])
+def test_a_reply_to_an_earlier_user_of_the_port_is_not_taken_for_the_reply_to_a_ping(data: bytes) -> None:
+    """As after a flight whose last requests were answered too late. Without the check the CRC was read: model 3233."""
+    bus, _ = opened(-1, status(IDS[0], 0, data))
+    assert bus.reports == SET_UP_REPORTS
+
+
+def test_a_late_reply_to_a_read_does_not_confirm_that_torque_is_off() -> None:
+    """A servo whose torque counts as off loses its watchdog, too."""
+    bus, line = opened(-1)
+    line.answer = lambda sent: b""
+    line.coming += [(line.now_s, status(servo_id, 0, bytes(dxl.BLOCK_SIZE))) for servo_id in IDS]
+    line.coming += [(line.now_s + 1e-3, status(servo_id, 0, bytes(dxl.BLOCK_SIZE))) for servo_id in IDS]
+    assert bus._confirmed(dxl.TORQUE_ENABLE, 0) == []

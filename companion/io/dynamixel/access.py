@@ -10,7 +10,8 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
-from dynamixel_sdk import COMM_SUCCESS, PacketHandler
+from dynamixel_sdk import COMM_SUCCESS
+from dynamixel_sdk.protocol2_packet_handler import Protocol2PacketHandler
 
 from companion.io.dynamixel.port import ServoPort
 from companion.io.dynamixel.registers import Register
@@ -21,6 +22,26 @@ ATTEMPTS: Final = 10
 ERROR_NUMBER: Final = 0x7F
 """Bits of a status packet's error byte that hold its error number."""
 _CRC_ERROR: Final = 3
+_PING, _READ = 0x01, 0x02
+_MODEL_AND_FIRMWARE_BYTES: Final = 3
+_ID, _LENGTH, _INSTRUCTION, _ERROR, _READ_SIZE = 4, slice(5, 7), 7, 8, slice(10, 12)
+"""Places in a packet."""
+_BESIDE_DATA_BYTES: Final = 4
+"""Bytes that a status packet's length counts beside the data: instruction, error and CRC."""
+
+
+class _Protocol(Protocol2PacketHandler):  # type: ignore[misc]
+    """The SDK's protocol, without replies to other requests: a status packet names its servo, but not its request, so that the SDK
+    takes the late reply to a write for that to a ping, and reads a model number from its CRC.
+    """
+
+    def txRxPacket(self, port: ServoPort, txpacket: list[int]) -> tuple[list[int] | None, int, int]:
+        """Send a request and return its reply; skip status packets that have more or less data than the reply has."""
+        reply, result, error = super().txRxPacket(port, txpacket)
+        while result == COMM_SUCCESS and reply is not None and not _replies(reply, txpacket):
+            reply, result = self.rxPacket(port, False)
+            error = reply[_ERROR] if result == COMM_SUCCESS else 0
+        return reply, result, error
 
 
 class ServoAccess:
@@ -41,7 +62,7 @@ class ServoAccess:
         before_attempt: Callable[[], None] = lambda: None,
     ) -> None:
         self.port = port
-        self.protocol = PacketHandler(2.0)
+        self.protocol = _Protocol()
         self._where = where
         self._names = names or {}
         self._before_attempt = before_attempt
@@ -137,3 +158,16 @@ class ServoAccess:
 
 def _arrived(result: int, error: int) -> bool:
     return bool(result == COMM_SUCCESS and error & ERROR_NUMBER != _CRC_ERROR)
+
+
+def _replies(reply: list[int], request: list[int]) -> bool:
+    """Return whether a status packet comes from the servo of the request and has the data of its reply, or refuses a read."""
+    reads = request[_INSTRUCTION] == _READ
+    size = _word(request[_READ_SIZE]) if reads else {_PING: _MODEL_AND_FIRMWARE_BYTES}.get(request[_INSTRUCTION], 0)
+    found = _word(reply[_LENGTH]) - _BESIDE_DATA_BYTES
+    refused = reads and found == 0 and reply[_ERROR] & ERROR_NUMBER
+    return reply[_ID] == request[_ID] and bool(found == size or refused)
+
+
+def _word(two: list[int]) -> int:
+    return two[0] | two[1] << 8
