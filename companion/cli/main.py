@@ -71,7 +71,7 @@ def _run(words: list[str]) -> int:
     Args:
         words: the command line after `_normalised`.
     """
-    code = 0
+    code = None
     try:
         code = _run_command(words)
         sys.stdout.flush()
@@ -79,15 +79,17 @@ def _run(words: list[str]) -> int:
 
         SteadyStream.raise_full()
     except OSError as error:
-        from companion.model.exit_codes import EXIT_BAD_INPUT
+        from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
         from companion.runtime.console import FULL, SteadyStream, print_error
 
         if error.errno not in (errno.EPIPE, *FULL) or error.filename is not None:
             raise
         SteadyStream(sys.stdout).discard()
         if error.errno == errno.EPIPE:
-            return code
+            return code or EXIT_OK
         print_error(f"{' '.join(['companion', *words[:1]])}: standard output cannot be written: {error.strerror}")
+        if code is not None and "fly" in words[:2]:  # the code is the flight's outcome, and 2 says that nothing moved
+            return code
         return code or EXIT_BAD_INPUT
     return code
 

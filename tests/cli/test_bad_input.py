@@ -5,6 +5,7 @@ Through the command's entry point, in this process; a few of each sort as a user
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import shlex
@@ -19,6 +20,7 @@ import pytest
 from companion.cli.campaign import reserved_folder
 from companion.cli.main import main
 from companion.model.exit_codes import EXIT_ABORTED, EXIT_BAD_INPUT, EXIT_OK
+from companion.runtime.console import SteadyStream
 from tests.analysis.synthetic_flight import record_flight
 from tests.support import CATCH, ROOT, Ended, Sandbox, sandbox_in
 
@@ -314,6 +316,22 @@ def test_output_that_cannot_be_written_is_one_line(command: str, unbuffered: str
     assert ended.stderr.splitlines() == [
         f"companion {name}: standard output cannot be written: No space left on device"
     ]
+
+
+def test_a_completed_flight_stays_completed_without_room_for_its_output(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 2 says that nothing has moved."""
+
+    def flown(_: argparse.Namespace) -> int:
+        SteadyStream(sys.stdout).write("completed\n" * 10_000)
+        return EXIT_OK
+
+    monkeypatch.setattr("companion.cli.flight._fly", flown)
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert main(["fly", "hover", "--sitl"]) == EXIT_OK
+    assert "standard output cannot be written" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
