@@ -139,7 +139,7 @@ def test_a_tick_without_a_time_is_damage(flown: Path, tmp_path: Path, time_s: fl
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_refuses_such_a_log(
+def test_every_command_refuses_a_log_whose_configuration_is_invalid(
     command: str, flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if command.startswith("export"):

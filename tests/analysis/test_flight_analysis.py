@@ -203,7 +203,7 @@ def test_what_the_plots_of_a_contact_smooth_is_the_mean_of_a_tenth_of_a_second()
     assert reached_s[-1] == 0.0
 
 
-def test_loop_and_latency_count_what_they_should() -> None:
+def test_missed_ticks_and_latencies_are_counted_correctly() -> None:
     def slow(i: Inputs, o: Outputs, s: Sent) -> Row:
         assert i.mocap is not None
         late_s = 0.006 if i.tick % 1000 == 999 else 0.001

@@ -62,7 +62,7 @@ def test_the_fit_is_the_truth_within_its_uncertainty() -> None:
 
 
 @pytest.mark.parametrize("slope_per_v", [-0.02, 0.0])
-def test_the_slope_over_the_voltage_is_the_truth_within_its_uncertainty(slope_per_v: float) -> None:
+def test_the_fitted_slope_over_voltage_agrees_with_the_truth_within_its_standard_error(slope_per_v: float) -> None:
     fit = fit_hover_thrust(with_battery(logged(), 1.5, slope_per_v))
     assert fit.slope is not None and fit.voltage_mean_v is not None and fit.voltage_span_v is not None
     assert fit.slope.per_v == pytest.approx(slope_per_v, abs=min(0.003, 4.0 * fit.slope.standard_error_per_v))

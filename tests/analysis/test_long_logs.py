@@ -79,7 +79,9 @@ def test_the_summary_says_that_it_is_thinned_out_and_grades_nearly_the_same(whol
     json.dumps(of_some, allow_nan=False)
 
 
-def test_the_report_says_so_too(thin: FlightLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_report_of_a_long_flight_names_the_share_of_ticks_kept(
+    thin: FlightLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(plot_style, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
     summary = summarise(thin, outcome="completed", controller="adaptive", preset="recommended")
     assert f"one in {thin.stride} (long flight)" in write_report(thin, summary, tmp_path).read_text()

@@ -35,5 +35,5 @@ def test_the_error_of_the_observer_counts_in_flight_only() -> None:
 
 
 @pytest.mark.parametrize(("observed", "measured"), [(None, None), ((0.0, 0.0, -2.0), None)])
-def test_without_both_forces_there_is_no_error(observed: Vec3 | None, measured: Vec3 | None) -> None:
+def test_the_observers_error_needs_both_forces(observed: Vec3 | None, measured: Vec3 | None) -> None:
     assert metrics.force_observer_error_n(flown(observed, measured)) is None

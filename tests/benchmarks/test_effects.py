@@ -10,7 +10,7 @@ from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import with_world
 
 
-def test_effects_of_the_laboratory_act_with_its_values_and_all_of_them_are_the_laboratory() -> None:
+def test_each_effect_has_the_values_of_the_laboratory_and_all_together_are_the_laboratory() -> None:
     lab, ideal = load_sitl(MISSION, world="lab"), load_sitl(MISSION, world="ideal").world
     whole = with_world(lab, {"seed": 3, "payload_kg": 0.2}).world.model_dump()
     plain = ideal.model_dump() | {"seed": 3, "payload_kg": 0.2}

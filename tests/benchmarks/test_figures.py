@@ -33,7 +33,7 @@ def row(p50: float, p99: float, target: Target | None, beside: dict[str, float] 
         (9.0, 9.0, None, ""),
     ],
 )
-def test_every_figure_that_a_target_names_must_meet_it(
+def test_a_target_is_met_if_every_percentile_that_it_names_meets_it(
     p50: float, p99: float, target: Target | None, verdict: str
 ) -> None:
     assert row(p50, p99, target).verdict == verdict
@@ -48,14 +48,14 @@ def test_every_figure_that_a_target_names_must_meet_it(
         ([], [10.0], 0),
     ],
 )
-def test_a_tick_is_alone_late_unless_the_loop_beside_was_late_close_to_it(
+def test_a_late_tick_counts_unless_the_comparison_loop_was_late_at_about_the_same_time(
     late_at_s: list[float], beside_at_s: list[float], alone: int
 ) -> None:
     late, beside = (np.full(len(times_s), 0.02) for times_s in (late_at_s, beside_at_s))
     assert late_alone(np.array(late_at_s), late, np.array(beside_at_s), beside) == [0.02] * alone
 
 
-def test_late_by_two_periods_counts_unless_the_loop_beside_was_late_by_one() -> None:
+def test_a_tick_late_by_two_periods_counts_unless_the_comparison_loop_was_late_by_one() -> None:
     start_s = np.array([1.0, 2.0, 3.0, 4.0])
     late_s = np.array([0.0101, 0.0099, 0.03, 0.02])
     beside_s = np.array([0.95, 3.02, 4.05])
@@ -63,7 +63,7 @@ def test_late_by_two_periods_counts_unless_the_loop_beside_was_late_by_one() -> 
     assert late_alone(start_s, late_s, beside_s, beside_late_s) == [0.0101, 0.02]
 
 
-def test_percentiles_are_samples() -> None:
+def test_percentiles_are_values_of_the_samples() -> None:
     found = Latency.of(number * 1e-3 for number in range(1001))
     assert (found.p50, found.p99, found.p999, found.max) == pytest.approx((500.0, 990.0, 999.0, 1000.0))
     with pytest.raises(ValueError, match="no samples"):

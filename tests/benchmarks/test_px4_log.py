@@ -53,11 +53,11 @@ def test_what_never_happened_is_none() -> None:
     )
 
 
-def test_modes_are_those_that_flew() -> None:
+def test_only_modes_flown_while_armed_are_listed() -> None:
     assert log(HOLD, OFFBOARD, LAND, DISARMED).modes() == "OFFBOARD, LAND"
 
 
-def test_a_file_that_is_none_is_one_line(tmp_path: Path) -> None:
+def test_a_file_that_is_no_ulog_is_refused_in_one_line(tmp_path: Path) -> None:
     pytest.importorskip("pyulog")
     file = tmp_path / "flight.ulg"
     file.write_bytes(b"no ulog")

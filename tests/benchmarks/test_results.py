@@ -134,7 +134,7 @@ def test_the_page_says_what_kind_of_run_it_was() -> None:
         assert line.count("|") in (0, 6, 7, 8, 9), line
 
 
-def test_the_committed_page_has_these_tables() -> None:
+def test_the_committed_page_has_the_tables_of_the_program() -> None:
     text = (ROOT / "docs/internals/benchmarks.md").read_text(encoding="utf-8")
     assert re.findall(r"^## (.+)$", text, flags=re.M) == [table.title for table in sections(GOOD)]
 

@@ -195,7 +195,7 @@ def pose(frame: int, stamp_s: float) -> Inputs:
     return Inputs(tick=frame, t_s=stamp_s, mocap=seen, command=OperatorCommand.NONE, recorder_dropped=0)
 
 
-def test_the_clocks_are_compared_by_the_frame_nearest_to_the_fault_that_both_know() -> None:
+def test_clocks_are_compared_at_the_frame_nearest_to_the_fault_that_both_logs_have() -> None:
     inputs = [pose(n, 100.0 + 0.005 * n) for n in range(400, 1000) if n % 7]
     frames = [(200, 1.0), (600, 3.0), (903, 4.5), (1100, 5.5)]
     assert _offset_s(inputs, frames, 5.4) == pytest.approx(100.0 + 0.005 * 904 - 4.5), (

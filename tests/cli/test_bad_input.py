@@ -342,7 +342,7 @@ def test_a_completed_flight_stays_completed_without_room_for_its_output(
         ("none.yaml", "<&- >&-", (EXIT_BAD_INPUT, "none.yaml: no such file\n")),
     ],
 )
-def test_a_standard_stream_that_is_closed_is_as_the_null_device(
+def test_a_command_runs_with_a_standard_stream_closed(
     sandbox: Sandbox, mission: str, closed: str, expected: tuple[int, str]
 ) -> None:
     ended = subprocess.run(

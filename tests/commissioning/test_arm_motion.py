@@ -124,7 +124,7 @@ def test_no_goal_lies_beyond_a_joint_limit(vehicle: Vehicle) -> None:
 
 
 @pytest.mark.parametrize("torque_max_nm", [None, 0.75])
-def test_an_obstacle_stops_it_gently(torque_max_nm: float | None) -> None:
+def test_an_obstacle_stops_the_arm_before_the_torque_is_high(torque_max_nm: float | None) -> None:
     """A small servo that cannot press as hard stops at its torque limit."""
     small = [] if torque_max_nm is None else [f"vehicle.arm.joints[1].torque_max_nm={torque_max_nm}"]
     bench = Bench(load_vehicle(SHIPPED, small))

@@ -85,7 +85,7 @@ def test_a_turned_sensor_is_a_patch_and_a_right_one_none() -> None:
     assert all(row.ok for row in ft_fit.rows(right))
 
 
-def test_straight_down_the_turn_is_undetermined_and_reported_so() -> None:
+def test_with_the_arm_straight_down_the_turn_about_the_link_is_reported_as_unknown() -> None:
     """A turn about the link is invisible there: the configured one is kept, with a warning."""
     seen = fitted(quat_of((90.0, 0.0, 0.0)), arm_rad=HANGING)
     assert len(seen.others) == 3
@@ -96,14 +96,14 @@ def test_straight_down_the_turn_is_undetermined_and_reported_so() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.9, 2.0])
-def test_a_wrong_scale_is_reported_and_no_turn_of_the_sensor(scale: float) -> None:
+def test_a_wrong_scale_is_reported_as_such_and_not_as_a_turned_sensor(scale: float) -> None:
     fit = fitted(quat_of((0.0, 0.0, 0.0)), scale=scale)
     assert fit.scale == pytest.approx(scale)
     assert [row.id for row in ft_fit.rows(fit) if not row.ok] == ["ft.scale"]
     assert ft_fit.changes(fit) == {}
 
 
-def test_a_weight_that_touches_something_is_no_turned_sensor() -> None:
+def test_a_weight_that_touches_something_is_not_reported_as_a_turned_sensor() -> None:
     fit = fitted(quat_of((0.0, 0.0, 0.0)), off_n=(3.0, 3.0, 0.0))
     assert ft_fit.changes(fit) == {}
     assert "ft.direction" in [row.id for row in ft_fit.rows(fit) if not row.ok]

@@ -80,7 +80,7 @@ def test_the_stated_intervals_hold_the_truth_and_are_narrow(flown: tuple[FlightL
         assert 0.5 * (high - low) < share * truth[key], found[key].line()
 
 
-def test_it_writes_a_world_and_a_vehicle_file_that_load(
+def test_identify_writes_a_world_and_a_vehicle_file_that_load(
     flown: tuple[FlightLog, dict[str, float]], tmp_path: Path
 ) -> None:
     log = record(flown[0], tmp_path / "flight.mcap")

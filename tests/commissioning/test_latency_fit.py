@@ -72,7 +72,7 @@ def measured(imu: list[ImuAt], poses: list[PoseAt]) -> list[TapDelay]:
     return [measure_tap(tap, imu, poses, noise) for tap in find_taps(imu)]
 
 
-def test_taps_are_found_and_sway_is_not() -> None:
+def test_taps_are_found_and_sway_is_not_taken_for_one() -> None:
     imu, _ = tapped(0.005)
     taps = find_taps(imu)
     assert [tap.t_s for tap in taps] == pytest.approx([at_s + 0.5 * TAP_S for at_s in TAPS_AT_S], abs=0.01)
@@ -97,7 +97,7 @@ def test_a_delay_is_found_finer_than_the_samples(delay_s: float) -> None:
     assert result.error_s < 0.001
 
 
-def test_each_taps_error_is_what_it_scatters_by() -> None:
+def test_the_stated_error_of_a_tap_is_the_scatter_of_its_delay() -> None:
     off, told = [], []
     for seed in range(10, 14):
         for tap in measured(*tapped(0.010, seed=seed)):

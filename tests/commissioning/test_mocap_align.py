@@ -69,7 +69,7 @@ def test_a_y_up_stream_read_as_such_is_right() -> None:
 
 
 @pytest.mark.parametrize("yaw_deg", [-90.0, 35.0, 180.0])
-def test_a_body_whose_zero_is_turned_is_no_turned_world(yaw_deg: float) -> None:
+def test_a_turned_body_is_not_reported_as_a_turned_world(yaw_deg: float) -> None:
     a = found(f"mocap_body_yaw_deg={yaw_deg}")
     assert abs(math.remainder(a.body_yaw_deg - yaw_deg, 360.0)) < 8.0
     assert a.world_yaw_deg == pytest.approx(0.0, abs=8.0)
@@ -77,7 +77,7 @@ def test_a_body_whose_zero_is_turned_is_no_turned_world(yaw_deg: float) -> None:
     assert not mocap_align.as_json(a)["right"]
 
 
-def test_a_turned_world_is_no_turned_body() -> None:
+def test_a_turned_world_is_not_reported_as_a_turned_body() -> None:
     a = found('mocap_axes=["y","-x","z"]')
     assert a.world_yaw_deg == pytest.approx(-90.0, abs=8.0)
     assert a.body_yaw_deg == pytest.approx(0.0, abs=8.0)

@@ -93,7 +93,9 @@ def test_a_pivot_that_is_right_is_ok(flights: list[str]) -> None:
         (["left", "right", "leaned", "--plane=1,2,3,0,0,0"], "a normal that is not zero, got '1,2,3,0,0,0'"),
     ],
 )  # fmt: skip
-def test_what_is_not_usable_is_one_line(flights: list[str], tmp_path: Path, words: list[str], expected: str) -> None:
+def test_flights_that_cannot_be_used_are_refused_in_one_line(
+    flights: list[str], tmp_path: Path, words: list[str], expected: str
+) -> None:
     hover = tmp_path / "hover"
     hover.mkdir()
     (hover / "config.json").write_text(load_flight("hover").model_dump_json())

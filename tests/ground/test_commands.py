@@ -172,7 +172,7 @@ def test_refused_and_never_answered(payload: bytes, reason: Reason) -> None:
     assert verdict.text.isprintable() and 0 < len(verdict.text) <= 200
 
 
-def test_retained_is_refused_though_genuine() -> None:
+def test_a_retained_command_is_refused_even_if_its_signature_is_valid() -> None:
     judge, payload = verifier(), to_json(made())
     assert judged(payload, judge, retained=True) is Reason.RETAINED
     assert judged(payload, judge) is Reason.REPLAYED

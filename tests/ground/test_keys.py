@@ -76,7 +76,7 @@ def test_users_own_file_is_made_once_and_private(home: Path) -> None:
     assert [path.name for path in default_operators_file().parent.iterdir()] == ["operators.yaml"]
 
 
-def test_umask_opens_no_file(home: Path) -> None:
+def test_key_files_are_private_whatever_the_umask_is(home: Path) -> None:
     before = os.umask(0)
     try:
         load_operators()

@@ -155,7 +155,7 @@ def waiting() -> Outputs:
         (False, AutopilotRequest.NONE, PhaseKind.DONE, False),
     ],
 )
-def test_when_the_rotors_may_turn(
+def test_a_heartbeat_says_whether_the_rotors_may_turn(
     pair: Pair, waiting: Outputs, armed: bool, request_: AutopilotRequest, kind: PhaseKind, lifting: bool
 ) -> None:
     client, guardian = pair

@@ -56,7 +56,7 @@ def test_a_sample_that_is_not_finite_does_not_corrupt_the_sum() -> None:
 
 
 @pytest.mark.parametrize("hz", [80.0, 125.3])
-def test_a_lost_sample_is_not_the_next_ones(hz: float) -> None:
+def test_a_lost_sample_is_not_replaced_by_the_next_one(hz: float) -> None:
     """One sample in 28 is lost, at random: each leaves no more than the vibration's own share of its interval."""
     draw = random.Random(1)
     total, lost = DeltaVelocity(), 0

@@ -245,7 +245,7 @@ class DeafToStart(ForceTorqueServer):
             super()._execute(command, parameter)
 
 
-async def test_a_start_that_is_lost_on_a_port_that_came_back_is_repeated(tmp_path: Path) -> None:
+async def test_a_lost_start_command_is_repeated_after_the_port_was_reopened(tmp_path: Path) -> None:
     async with AsyncExitStack() as stack:
         async with ForceTorqueServer() as server, world(server):
             with plugged(tmp_path / "force", server.port) as port:
@@ -258,7 +258,7 @@ async def test_a_start_that_is_lost_on_a_port_that_came_back_is_repeated(tmp_pat
                 assert server.missed
 
 
-async def test_a_port_that_is_lost_again_while_the_sensor_starts_ends_that_start(tmp_path: Path) -> None:
+async def test_the_start_of_a_sensor_is_cancelled_if_its_port_is_lost_again(tmp_path: Path) -> None:
     async with AsyncExitStack() as stack:
         async with ForceTorqueServer() as server, world(server):
             with plugged(tmp_path / "force", server.port) as port:
@@ -325,7 +325,7 @@ async def test_sensor_that_answers_but_never_streams() -> None:
         assert "0 of 5 samples after START within 1 s" in text
 
 
-async def test_other_model() -> None:
+async def test_a_sensor_of_another_model_is_refused() -> None:
     async with ForceTorqueServer(product_name="RFT40-SA01") as server:
         assert 'a "RFT40-SA01" answers, expected a RFT60-HA01' in await refusal(driver(server.port))
 

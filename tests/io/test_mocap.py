@@ -128,7 +128,7 @@ async def test_the_latency_contains_the_delay_on_the_network() -> None:
         assert max(latencies_s) >= 0.15
 
 
-async def test_unicast_client_of_a_multicast_server() -> None:
+async def test_a_multicast_server_also_serves_a_unicast_client() -> None:
     async with (
         NatNetServer(multicast_group=GROUP) as server,
         streaming(server, POSE),
@@ -344,12 +344,12 @@ async def test_port_in_use() -> None:
             assert f"cannot open UDP {GROUP}:{server.data_port}: another program holds the port" in text
 
 
-async def test_interface_of_another_machine() -> None:
+async def test_an_interface_address_of_another_computer_is_refused() -> None:
     async with NatNetServer() as server:
         text = await refusal(mocap(device_for(server, interface="192.0.2.1")))
         assert "set devices.mocap.interface to an address of this computer" in text
 
 
-async def test_server_name_that_is_no_address() -> None:
+async def test_a_server_name_that_cannot_be_resolved_is_refused() -> None:
     device = MocapDevice(server="256.256.256.256", interface="127.0.0.1", rigid_body_id=1)
     assert "the name cannot be resolved" in await refusal(mocap(device))

@@ -33,7 +33,7 @@ def test_the_cores_are_found_on_a_thread_of_their_own() -> None:
 
 
 @several
-def test_cores_that_this_process_is_not_on_are_found() -> None:
+def test_usable_cores_include_those_outside_the_own_affinity_mask() -> None:
     ask = f"import os; os.sched_setaffinity(0, {{{CORES[0]}}}); "
     ask += "from companion.runtime.cores import usable_cpus; print(list(usable_cpus()))"
     ended = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
@@ -59,7 +59,9 @@ def test_the_others_are_never_the_flights_own(own: frozenset[int], now: frozense
         ({0, 1}, {0, 1}, {0, 1}, set()),
     ],
 )
-def test_where_the_others_go(own: set[int], now: set[int], usable: set[int], found: set[int]) -> None:
+def test_other_processes_get_the_usable_cores_that_the_flight_does_not_use(
+    own: set[int], now: set[int], usable: set[int], found: set[int]
+) -> None:
     assert others(own, now, usable) == found
 
 

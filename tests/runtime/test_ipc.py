@@ -28,7 +28,7 @@ def test_a_message_arrives_and_one_that_cannot_says_so() -> None:
         assert ipc.receive(ours) is None
 
 
-def test_what_was_said_before_the_end_is_heard_although_the_other_left_something_unread() -> None:
+def test_the_last_message_of_an_ended_process_is_received_even_if_it_left_messages_unread() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with ours:
         with theirs:

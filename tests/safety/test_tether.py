@@ -150,7 +150,9 @@ def circle(turns: float, *, yaw_turns: float = 0.0, centre: Vec3 = ANCHOR) -> Ca
         (lambda share: ((0.0, -1.2, 0.5 + share), LEVEL), 0.0),  # straight above it
     ],
 )
-def test_winding(way: Callable[[float], tuple[Vec3, Quat]], turns: float) -> None:
+def test_turns_of_the_tether_around_its_anchor_are_counted(
+    way: Callable[[float], tuple[Vec3, Quat]], turns: float
+) -> None:
     found = turned(way)
     assert found == pytest.approx(turns, abs=1e-6)
 

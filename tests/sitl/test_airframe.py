@@ -39,7 +39,7 @@ def torque_nm(vehicle: Vehicle, thrusts_n: Sequence[float], **settings: Any) -> 
 
 
 @pytest.mark.parametrize(("arm_m", "yaw_m"), [(0.325, 0.025), (0.22, 0.016)])
-def test_the_rotors_turn_it_by_their_arm_and_by_their_yaw_torque(arm_m: float, yaw_m: float) -> None:
+def test_torque_follows_from_the_rotor_arm_and_the_yaw_torque_per_thrust(arm_m: float, yaw_m: float) -> None:
     vehicle = with_airframe(rotor_arm_m=arm_m, yaw_torque_per_thrust_m=yaw_m)
     offset_m = arm_m / math.sqrt(2.0)
     front_right, rear_left, front_left, rear_right = 8.0, 7.0, 6.0, 5.0
