@@ -31,6 +31,9 @@ from companion.model.types import Inputs
 from companion.plugins import PluginError
 
 _RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}
+_TORN = "/inputs, /outputs and /sent hold different ticks"
+Row = tuple[Inputs, Outputs, Sent]
+"""A tick."""
 _TOPICS = tuple(_RECORDS)
 """Topics in the order of a tick's records in the file."""
 _FORMER_NAMES = (
@@ -78,51 +81,24 @@ class FlightLog:
         """Read a log.
 
         Args:
-            ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes about 8 kB of
-                memory. None keeps all, which a replay needs.
+            ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes about 9 kB of
+                memory. None keeps all.
 
         Raises:
             LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, has metadata with invalid
                 values, or has records whose fields differ from those of this version. An optional field that an older log lacks is
                 read as None.
         """
-        rows = _Rows(ticks_max)
-        metadata: dict[str, dict[str, str]] = {}
-        channels: dict[int, str] = {}
-        closed = False
-        try:
-            for record in _mcap_records(path):
-                if isinstance(record, Channel):
-                    channels[record.id] = record.topic
-                elif isinstance(record, Message):
-                    topic = channels[record.channel_id]
-                    if topic in _RECORDS:
-                        data = record.data
-                        for former, name in _FORMER_NAMES:
-                            data = data.replace(former, name)
-                        rows.take(topic, from_json(_RECORDS[topic], data))
-                elif isinstance(record, Metadata):
-                    metadata[record.name] = dict(record.metadata)
-                elif isinstance(record, Footer):
-                    closed = True
-        except RecordError as error:
-            raise LogError(
-                f"{path}: its records' fields differ from this version's ({error}); it was written by {writer(metadata)}: "
-                "open it with that version"
-            ) from None
-        except (McapError, ZstdError, RuntimeError, MemoryError, struct.error, ValueError, KeyError) as error:
-            raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
-        if "companion" not in metadata:
-            raise LogError(f"{path}: an MCAP file, but not a flight log: it has no 'companion' metadata record")
-        if not rows.whole():
-            raise LogError(f"{path}: damaged: /inputs, /outputs and /sent hold different ticks")
+        reading, rows = _Reading(path), _Rows(ticks_max)
+        for row in reading.ticks():
+            rows.take(row)
         log = FlightLog(
             path=path,
             inputs=tuple(row[0] for row in rows.kept),
             outputs=tuple(row[1] for row in rows.kept),
             sent=tuple(row[2] for row in rows.kept),
-            metadata=metadata,
-            closed=closed,
+            metadata=reading.metadata,
+            closed=reading.closed,
             stride=rows.stride,
             measured=rows.measured,
         )
@@ -140,12 +116,6 @@ class FlightLog:
                 read()
             except ValueError as error:
                 raise LogError(f"{self.path}: metadata '{name}': {error}") from None
-        for inputs, outputs in zip(self.inputs, self.outputs, strict=True):
-            for t_s in (inputs.t_s, outputs.t_s):
-                if not abs(t_s) <= _T_S_MAX:
-                    raise LogError(
-                        f"{self.path}: damaged: tick {inputs.tick} has the time {t_s} s (limit {_T_S_MAX:g} s)"
-                    )
 
     @property
     def epoch_offset_ns(self) -> int:
@@ -200,9 +170,13 @@ class FlightLog:
         """Return the timing of every recorded tick, whether kept or not."""
         return self.measured or timing_of(self.rows())
 
-    def rows(self) -> Iterator[tuple[Inputs, Outputs, Sent]]:
+    def rows(self) -> Iterator[Row]:
         """Iterate over the ticks in order."""
         return zip(self.inputs, self.outputs, self.sent, strict=True)
+
+    def every_tick(self) -> Iterator[Row]:
+        """Iterate over the ticks in order, those that were thinned out too: a thinned log's file is read again, tick by tick."""
+        return self.rows() if self.stride == 1 else _Reading(self.path).ticks()
 
     @cached_property
     def joint_count(self) -> int:
@@ -269,35 +243,76 @@ def _cells(record: Any) -> dict[str, Any]:
     }
 
 
+class _Reading:
+    """One reading of a log's file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.closed = False
+
+    def ticks(self) -> Iterator[Row]:
+        """Iterate over the ticks, whose three records a chunk holds whole; raises the errors of `FlightLog.read`."""
+        path, metadata = self._path, self.metadata
+        channels: dict[int, str] = {}
+        row: list[Any] = []
+        try:
+            for record in _mcap_records(path):
+                if isinstance(record, Channel):
+                    channels[record.id] = record.topic
+                elif isinstance(record, Message):
+                    topic = channels[record.channel_id]
+                    if topic in _RECORDS:
+                        data = record.data
+                        for former, name in _FORMER_NAMES:
+                            data = data.replace(former, name)
+                        part: Any = from_json(_RECORDS[topic], data)
+                        if topic != _TOPICS[len(row)] or (row and part.tick != row[0].tick):
+                            raise ValueError(_TORN)
+                        row.append(part)
+                        if len(row) == len(_TOPICS):
+                            inputs, outputs, sent = row
+                            row = []
+                            for t_s in (inputs.t_s, outputs.t_s):
+                                if not abs(t_s) <= _T_S_MAX:
+                                    raise ValueError(f"tick {inputs.tick} has the time {t_s} s (limit {_T_S_MAX:g} s)")
+                            yield inputs, outputs, sent
+                elif isinstance(record, Metadata):
+                    metadata[record.name] = dict(record.metadata)
+                elif isinstance(record, Footer):
+                    self.closed = True
+            if row:
+                raise ValueError(_TORN)
+        except RecordError as error:
+            raise LogError(
+                f"{path}: its records' fields differ from this version's ({error}); it was written by {writer(metadata)}: "
+                "open it with that version"
+            ) from None
+        except (McapError, ZstdError, RuntimeError, MemoryError, struct.error, ValueError, KeyError) as error:
+            raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
+        if "companion" not in metadata:
+            raise LogError(f"{path}: an MCAP file, but not a flight log: it has no 'companion' metadata record")
+
+
 class _Rows:
-    """Assembles the three records of each tick, which a chunk holds whole, and thins the ticks when there are too many."""
+    """Keeps ticks, and thins them out when there are too many."""
 
     def __init__(self, ticks_max: int | None) -> None:
         self._ticks_max = ticks_max
         self._stopwatch = Stopwatch() if ticks_max is not None else None
-        self._open: list[Any] = []
-        self.kept: list[tuple[Inputs, Outputs, Sent]] = []
+        self.kept: list[Row] = []
         self.stride = 1
-        self._torn = False
 
-    def take(self, topic: str, record: Any) -> None:
-        """Add the next record of the file."""
-        expected = _TOPICS[len(self._open)]
-        if topic != expected or (self._open and record.tick != self._open[0].tick):
-            self._torn = True
-            return
-        self._open.append(record)
-        if len(self._open) == len(_TOPICS):
-            inputs, outputs, sent = self._open
-            self._open = []
-            if self._stopwatch is not None:
-                self._stopwatch.take(inputs, sent)
-            row = (inputs, outputs, sent)
-            if self._wanted(row):
-                self.kept.append(row)
-                self._thin_out()
+    def take(self, row: Row) -> None:
+        """Add the next tick of the file."""
+        inputs, _, sent = row
+        if self._stopwatch is not None:
+            self._stopwatch.take(inputs, sent)
+        if self._wanted(row):
+            self.kept.append(row)
+            self._thin_out()
 
-    def _wanted(self, row: tuple[Inputs, Outputs, Sent]) -> bool:
+    def _wanted(self, row: Row) -> bool:
         inputs, outputs, _ = row
         return inputs.tick % self.stride == 0 or bool(outputs.events) or outputs.outcome is not None
 
@@ -305,10 +320,6 @@ class _Rows:
         if self._ticks_max is not None and len(self.kept) > self._ticks_max:
             self.stride *= 2
             self.kept = [row for row in self.kept if self._wanted(row)]
-
-    def whole(self) -> bool:
-        """Return whether every tick had its three records."""
-        return not self._torn and not self._open
 
     @property
     def measured(self) -> Timing | None:

@@ -27,6 +27,10 @@ OLDER_FINGERPRINTS = (
 """Fingerprints of records that lack only fields that have a default now."""
 
 
+_TICKS_MAX = 20_000
+"""Ticks of a log that are kept in memory; a longer log is read twice, which takes a sixth more time."""
+
+
 class Core(Protocol):
     """The part of `companion.core.flight_core.FlightCore` that replay needs."""
 
@@ -75,16 +79,18 @@ def replay(log: FlightLog, make_core: Callable[[str], Core]) -> ReplayResult:
         raise LogError(
             f"{log.path}: the recorded configuration is not compatible with this version: {reason}"
         ) from None
-    for k, (inputs, logged) in enumerate(zip(log.inputs, log.outputs, strict=True)):
+    ticks = 0
+    for inputs, logged, _ in log.every_tick():
+        ticks += 1
         recomputed = from_packet(Outputs, to_packet(core.step(inputs)))  # as in a log, where a float 1 is 1.0
         found = differences(logged, recomputed)
         if found is not None:
             field, old, new = found
             return ReplayResult(
-                k + 1,
+                ticks,
                 Difference(tick=inputs.tick, t_s=inputs.t_s, field=field or "outputs", logged=old, recomputed=new),
             )
-    return ReplayResult(len(log.inputs), None)
+    return ReplayResult(ticks, None)
 
 
 def check_replayable(log: FlightLog) -> str:
@@ -111,10 +117,10 @@ def check_replayable(log: FlightLog) -> str:
         raise LogError(f"{log.path}: has no configuration (metadata record 'config'); it cannot be replayed")
     if not log.inputs:
         raise LogError(f"{log.path}: has no ticks")
-    first, missing = log.inputs[0].tick, log.missing_ticks()
+    first, missing = log.timing.first_tick, log.missing_ticks()
     if first != 0 or missing:
         what = (
-            f"{missing} of {log.inputs[-1].tick - first + 1} ticks are missing"
+            f"{missing} of {log.timing.last_tick - first + 1} ticks are missing"
             if missing
             else f"the first {first} ticks are missing"
         )
@@ -151,7 +157,7 @@ def flight_core(config_json: str) -> Core:
 def run(path: Path) -> int:
     """Run `companion replay FILE`: 0 if every output is bit-identical, 1 if not, 2 if the log cannot be replayed."""
     try:
-        result = replay(FlightLog.read(path), flight_core)
+        result = replay(FlightLog.read(path, ticks_max=_TICKS_MAX), flight_core)
     except LogError as error:
         print(error, file=sys.stderr)
         return 2

@@ -8,13 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from companion.analysis import plot_style
 from companion.analysis.log import FlightLog
 from companion.analysis.metrics import catch_index
+from companion.analysis.replay import replay
 from companion.analysis.report import write_report
 from companion.analysis.summary import summarise
 from companion.launcher.run import TICKS_MAX
+from companion.model.outputs import Outputs
+from companion.model.types import Inputs
 from companion.recorder.client import RecorderProcess
 from tests.analysis.synthetic_flight import CONFIG, record_flight, synthetic_flight
 
@@ -77,6 +81,27 @@ def test_the_summary_says_that_it_is_thinned_out_and_grades_nearly_the_same(whol
         assert of_some["rms"][part]["e_p_m"] == pytest.approx(of_all["rms"][part]["e_p_m"], rel=0.1)
     assert catch_index(thin) is not None
     json.dumps(of_some, allow_nan=False)
+
+
+def test_a_replay_compares_every_tick_of_a_thinned_out_log(whole: FlightLog, thin: FlightLog) -> None:
+    thinned_out = 4 * thin.stride + 1
+    assert thinned_out not in [inputs.tick for inputs in thin.inputs]
+
+    class Recited:
+        """A core that returns what was flown, but for one tick."""
+
+        def __init__(self, other_tick: int) -> None:
+            self._other_tick = other_tick
+
+        def step(self, inputs: Inputs) -> Outputs:
+            outputs = whole.outputs[inputs.tick]
+            return outputs if inputs.tick != self._other_tick else replace(outputs, phase="another")
+
+    same = replay(thin, lambda _: Recited(-1))
+    assert (same.ticks, same.first_difference) == (len(whole.inputs), None)
+    other = replay(thin, lambda _: Recited(thinned_out)).first_difference
+    assert other is not None
+    assert (other.tick, other.field) == (thinned_out, "phase")
 
 
 def test_the_report_of_a_long_flight_names_the_share_of_ticks_kept(
