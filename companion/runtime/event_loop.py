@@ -46,7 +46,7 @@ def fine_loop() -> asyncio.AbstractEventLoop:
     return asyncio.SelectorEventLoop(_Selector())
 
 
-class _SimulatedSelector(selectors.SelectSelector):
+class _SimulatedSelector(selectors.PollSelector):
     """Reports to the world when nothing is left to do at the present instant, then waits for the next grant."""
 
     def __init__(self, simulated: SimulatedTime) -> None:
@@ -66,7 +66,7 @@ class _SimulatedSelector(selectors.SelectSelector):
         simulated = self._simulated
         if ready or (timeout is not None and timeout <= 0.0):
             return ready
-        if self.held or simulated.lost:
+        if self.held or simulated.known_lost:
             return super().select(timeout if simulated.lost else None)
         simulated.report(math.inf if timeout is None else simulated.now() + timeout)
         self._grant.poll()

@@ -147,6 +147,11 @@ class SimulatedTime:
         return self._channel.fileno()
 
     @property
+    def known_lost(self) -> bool:
+        """Whether the end of the world has been noticed, at the latest by the next `report` or `take_grants`. Asks no kernel."""
+        return self._lost is not None
+
+    @property
     def lost(self) -> bool:
         """Whether the world has ended. Called from any thread."""
         if self._lost is None:
@@ -181,13 +186,15 @@ class SimulatedTime:
     def take_grants(self) -> bool:
         """Read the grants that have arrived; return whether there was one."""
         taken = False
-        while not self.lost:
+        while True:
             try:
                 (self._grant,) = GRANT.unpack(self._channel.recv(GRANT.size))
-            except (BlockingIOError, struct.error):
-                break
+            except BlockingIOError:
+                return taken
+            except (OSError, struct.error):  # the world has ended
+                _ = self.lost
+                return taken
             taken = True
-        return taken
 
     def wait(self, waiting: select.poll, timeout_s: float, *, data: bool) -> list[tuple[int, int]]:
         """Wait like `waiting.poll`, with a timeout in simulated time; for a process without an event loop.
