@@ -318,15 +318,23 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         _advised(
             "MPC_ACC_HOR",
             8.0,
-            "acceleration, m/s^2; if it is smaller, LAND stops further ahead (0.53 m after a takeover with PX4's default of 3); "
-            "MPC_JERK_AUTO and MPC_TILTMAX_AIR keep the actual acceleration below it",
+            "acceleration, m/s^2; if it is smaller, LAND sets its stop point further ahead; MPC_TILTMAX_AIR keeps the actual "
+            "acceleration below it",
             limits=(5.0, 10.0),
         ),
-        _advised(
+        Wanted(
             "MPC_JERK_AUTO",
-            6.0,
-            "jerk, m/s^3; if smaller, PX4 brakes later; if larger, LAND approaches its stop point faster",
-            limits=(4.0, 8.0),
+            80.0,
+            "jerk, m/s^3, at which LAND of PX4 1.18 ends the acceleration that it begins with; with PX4's default of 4 it flies metres "
+            "past its stop point",
+            limits=(60.0, 80.0),
+        ),
+        Wanted(
+            "MPC_XY_CRUISE",
+            0.1,
+            "speed, m/s, to which LAND brakes at once and with which it continues to its stop point; if larger, it touches down at "
+            "speed and slides past it. Return flies home at this speed",
+            limits=(0.05, 0.1),
         ),
         _advised(
             "MPC_XY_VEL_MAX",

@@ -13,6 +13,7 @@ from companion.config.devices import NatNetVersion, ServoBaud
 from companion.config.explain import nearest
 from companion.model.servos import ServoName
 from companion.px4.defaults import PX4_DEFAULTS
+from companion.px4.versions import Release
 from companion.sitl_config.bar import Bar
 from companion.sitl_config.effects.air import Air
 from companion.sitl_config.effects.barometer import Barometer
@@ -196,6 +197,8 @@ class World(Model):
     """Number of taps on the frame per round. If it is above 0, the vehicle is only lifted and held, for latency measurement."""
     handling_tap_n: Positive = 30.0
     """Peak force of a tap."""
+    px4_version: Literal["1.16", "1.18"] = "1.16"
+    """Version of PX4 that the stub imitates where they differ: LAND and Hold of 1.18 start with the acceleration of that moment."""
     px4_params: Px4Params = Field(default={})
     """PX4 parameters by name; they override the parameters of the simulated vehicle. The stub has fewer of them than a real PX4."""
     faults: tuple[Fault, ...] = ()
@@ -222,6 +225,12 @@ class World(Model):
     def servo(self, joint: int) -> Servo:
         """Return the settings of a joint's servo; joints are counted from 0."""
         return self.servos[joint] if self.servos is not None and joint < len(self.servos) else Servo()
+
+    @property
+    def px4_release(self) -> Release:
+        """Return `px4_version` as numbers."""
+        major, minor = map(int, self.px4_version.split("."))
+        return major, minor
 
     @property
     def thr_mdl_fac(self) -> float:

@@ -25,7 +25,6 @@ from sitl.world.machine import Machine
 
 LINK_DELAY_S = 0.002
 """Time from sending a setpoint to its arrival at PX4 where the link itself takes no simulated time."""
-STUB_VERSION = "1.16"
 
 
 class Observation(NamedTuple):
@@ -120,7 +119,7 @@ def stub_of(config: WorldConfig, airframe: Airframe, link_delay_s: float = 0.0) 
         config: configuration of the world; `setpoint_delay_s`, `thr_mdl_fac`, `px4_params` and the biases of `imu` are used.
         link_delay_s: added to the setpoint delay, for a loop without a real link.
     """
-    params = Params()
+    params = Params(release=config.px4_release)
     params.set("MAV_TYPE", mav_type(airframe.rotor_layout.count))
     params.set("CA_ROTOR_COUNT", airframe.rotor_layout.count)
     for name, value in geometry_of(airframe).items():
@@ -250,4 +249,4 @@ class StubBackend(AutopilotBackend):
 
     def about(self) -> dict[str, Any]:
         """Return the kind "stub" and the PX4 version that it imitates."""
-        return {"kind": "stub", "version": STUB_VERSION}
+        return {"kind": "stub", "version": self._config.px4_version}

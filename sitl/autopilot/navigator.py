@@ -9,6 +9,7 @@ import math
 from enum import Enum, auto
 
 from companion.model.constants import STANDARD_GRAVITY_M_S2
+from companion.model.frames import quat_rotate
 from companion.model.types import Vec3
 from sitl.autopilot.modes import NavState
 from sitl.autopilot.params import Params
@@ -19,6 +20,8 @@ from sitl.autopilot.types import AttitudeTarget, Estimate
 
 _STOP_AHEAD_S = 0.6
 """Delay until full deceleration (a constant in Navigator::preproject_stop_point of PX4 1.16)."""
+_MEASURED_ACCELERATION = (1, 18)
+"""First version whose trajectories start with the measured acceleration; earlier ones start with none (FlightTaskAuto::activate)."""
 _BLIND_DESCENT_M_S2 = 0.3
 """Downward acceleration that FlightTaskDescend commands without a vertical velocity estimate."""
 _DESCENT_SLEW_M_S2 = 1.0
@@ -70,7 +73,9 @@ class Navigator:
             self.settle(landed)
         if landed or previous is None or previous is NavState.OFFBOARD:
             self.control.reset()
-        self._way = Smoothing(estimate.position_ned_m[:2], estimate.velocity_ned_m_s[:2])
+        ax, ay, _ = quat_rotate(estimate.attitude_ned_frd, estimate.accel_frd_m_s2)
+        acceleration = (ax, ay) if self._params.release >= _MEASURED_ACCELERATION else (0.0, 0.0)
+        self._way = Smoothing(estimate.position_ned_m[:2], estimate.velocity_ned_m_s[:2], acceleration)
         if state is NavState.LOITER and came_from_takeoff:
             return
         self._yaw_rad = heading_rad(estimate.attitude_ned_frd)

@@ -1,7 +1,7 @@
 """Parameter store of the PX4 stub: PX4's names, types, order, wire encoding and defaults for this vehicle.
 
 Values are stored as in PX4: INT32, or REAL32 in single precision. The defaults are those of PX4 1.16, except for `VEHICLE_DEFAULTS`:
-settings for flying indoors with motion capture as the only position source, and lower speeds for a small room.
+settings for flying indoors with motion capture as the only position source, and a lower take-off speed for a small room.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from companion.px4.defaults import PX4_DEFAULTS as PX4_DEFAULTS
 from companion.px4.params_file import single
 from companion.px4.required import simulated_values
-from companion.px4.versions import has
+from companion.px4.versions import Release, has
 
 MAV_PARAM_TYPE_INT32 = 6
 MAV_PARAM_TYPE_REAL32 = 9
@@ -28,7 +28,6 @@ VEHICLE_DEFAULTS: Mapping[str, Value] = {
     **{name: value for name, value in simulated_values().items() if has(name, VERSION)},
     "BAT1_CAPACITY": 5200.0,
     "MPC_TKO_SPEED": 0.6,
-    "MPC_XY_CRUISE": 1.0,
 }
 
 
@@ -44,13 +43,17 @@ def mav_type(rotors: int) -> int:
 class Params:
     """The autopilot's parameters; as in PX4, they are indexed in alphabetical order."""
 
-    def __init__(self, overrides: Mapping[str, Value] | None = None) -> None:
+    def __init__(self, overrides: Mapping[str, Value] | None = None, release: Release = VERSION) -> None:
         """Set the defaults of this vehicle, then `overrides`.
+
+        Args:
+            release: version of PX4 that the stub imitates. Names and defaults are those of `VERSION` in any case.
 
         Raises:
             KeyError: an override names an unknown parameter.
             ValueError: an override is not finite, or is not a whole number in the range of INT32 although the parameter is an INT32.
         """
+        self.release = release
         self.revision = 0
         """Counter that increases with every change, so that caches can detect changes."""
         self._integer = {name: isinstance(default, int) for name, default in PX4_DEFAULTS.items()}

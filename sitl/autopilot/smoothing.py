@@ -20,15 +20,16 @@ class Smoothing:
     """Position, velocity and acceleration of the trajectory in the horizontal plane, local NED.
 
     Args:
-        velocity_ned_m_s: horizontal velocity at the start; the initial acceleration is zero.
+        velocity_ned_m_s: horizontal velocity at the start.
+        acceleration_ned_m_s2: horizontal acceleration at the start.
     """
 
     __slots__ = ("acceleration_m_s2", "position_m", "velocity_m_s")
 
-    def __init__(self, position_ned_m: Vec2, velocity_ned_m_s: Vec2) -> None:
+    def __init__(self, position_ned_m: Vec2, velocity_ned_m_s: Vec2, acceleration_ned_m_s2: Vec2 = (0.0, 0.0)) -> None:
         self.position_m = position_ned_m
         self.velocity_m_s = velocity_ned_m_s
-        self.acceleration_m_s2: Vec2 = (0.0, 0.0)
+        self.acceleration_m_s2 = acceleration_ned_m_s2
 
     def step(self, dt_s: float, to_ned_m: Vec2, params: Params) -> None:
         """Advance the trajectory towards the point by one period of the position loop."""

@@ -20,8 +20,8 @@ Message = Any
 _NAN = math.nan
 _NO_COVARIANCE = [_NAN] * 21
 _PRESSURE_HPA, _TEMPERATURE_C = 1013.25, 25.0
-_VERSION = 1 << 24 | 16 << 16 | 1 << 8 | 255
-"""Encoded version: 1.16.1, release."""
+_PATCH_RELEASE = 1 << 8 | 255
+"""Patch number 1 and type of a release, encoded."""
 
 
 def _ms(stub: Px4Stub) -> int:
@@ -301,7 +301,9 @@ def vibration(stub: Px4Stub) -> Message:
 
 
 def autopilot_version(stub: Px4Stub) -> Message:
-    """Return AUTOPILOT_VERSION for PX4 1.16.1."""
+    """Return AUTOPILOT_VERSION: that of PX4 1.16.1, or of another release."""
+    major, minor = stub.params.release
+    version = major << 24 | minor << 16 | _PATCH_RELEASE
     capabilities = (
         mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
         | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
@@ -312,7 +314,7 @@ def autopilot_version(stub: Px4Stub) -> Message:
         | mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     )
     return mavlink.MAVLink_autopilot_version_message(
-        capabilities, _VERSION, _VERSION, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, stub.params.integer("MAV_SYS_ID")
+        capabilities, version, version, 0, 0, [0] * 8, [0] * 8, [0] * 8, 0, 0, stub.params.integer("MAV_SYS_ID")
     )
 
 

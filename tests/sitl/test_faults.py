@@ -22,10 +22,11 @@ from sitl.campaigns.faults import fly
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 from sitl.faults.timing import FaultError, with_fault_times
-from tests.support import CATCH, HOVER, SHORT_CATCH
+from tests.support import CATCH, HOVER, ROOT, SHORT_CATCH
 
 pytestmark = pytest.mark.usefixtures("short_start")
 
+INTERCEPT = ROOT / "configs/missions/intercept.yaml"
 CONFIG = load_sitl(CATCH, preset="recommended")
 LINE_M_S = 0.74
 """The line of the catch, in its middle."""
@@ -292,6 +293,20 @@ def test_poses_lost_on_the_line_end_in_a_landing_and_after_the_gap_the_vehicles_
     )
     assert drift_m <= StopModel(safety).distance_m(LINE_M_S)
     assert not result.crashed and not result.armed
+
+
+def test_hung_in_the_chase_of_a_ball_px4_1_18_stops_it_within_half_a_metre() -> None:
+    """LAND of PX4 1.18 begins with the acceleration of the chase: with MPC_JERK_AUTO 6 it flew on for 2.5 m."""
+    hang = json.dumps([{"kind": "stop_flight", "after": "throw", "t_s": 0.4}])
+    settings = [f"world.faults={hang}", 'world.px4_version="1.18"', "world.seed=1"]
+    begun_s, _, result, _ = fault_and_events(load_sitl(INTERCEPT, overrides=settings, world="careless"))
+    assert result.layout is not None and result.guardian_landed
+    moves = [
+        truth.position_world_m[:2]
+        for truth in (*result.truth, *map(result.layout.truth, result.after))
+        if truth.t_s >= begun_s
+    ]
+    assert max(math.dist(moves[0], position) for position in moves) < 0.5
 
 
 def test_a_second_payload_is_carried_too_and_one_that_is_dropped_is_felt_no_more() -> None:

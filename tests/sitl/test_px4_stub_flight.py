@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import copy
+import math
 from functools import cache
 
 import pytest
 
+from companion.config.safety import Safety
+from companion.px4.versions import Release
+from companion.safety.stop import StopModel
 from sitl.autopilot.commander import Command, Result
 from sitl.autopilot.land_detector import LandDetector
 from sitl.autopilot.modes import NavState
@@ -74,6 +78,38 @@ def test_offboard_follows_position_and_velocity_setpoints() -> None:
     assert rig.stub.heading_rad == pytest.approx(0.5, abs=0.05)
     stream(rig, 3.0, PositionTarget(velocity_ned_m_s=(0.3, 0.0, 0.0), yaw_rad=0.5))
     assert rig.plant.velocity_ned_m_s == pytest.approx((0.3, 0.0, 0.0), abs=0.08)
+
+
+def drift_m(release: Release, tilt_deg: float, **params: float) -> tuple[float, float]:
+    """How far LAND goes that begins in a fast and accelerated motion, and the speed at its beginning."""
+    rig = hovering(**params)
+    rig.params.release = release
+    along = PositionTarget(velocity_ned_m_s=(0.6, 0.0, 0.0), yaw_rad=0.0)
+    stream(rig, 0.1, along)
+    assert rig.mode(6) is Result.ACCEPTED
+    stream(rig, 3.0, along)
+    half = math.radians(tilt_deg) / 2.0
+    stream(rig, 0.2, AttitudeTarget((math.cos(half), 0.0, -math.sin(half), 0.0), rig.params.real("MPC_THR_HOVER")))
+    assert rig.mode(4, 6) is Result.ACCEPTED
+    begin_m, speed_m_s = rig.plant.position_ned_m, math.hypot(*rig.plant.velocity_ned_m_s[:2])
+    farthest_m = 0.0
+    for _ in range(1200):
+        rig.step()
+        farthest_m = max(farthest_m, math.dist(begin_m[:2], rig.plant.position_ned_m[:2]))
+    return farthest_m, speed_m_s
+
+
+@pytest.mark.parametrize("release", [(1, 16), (1, 18)])
+@pytest.mark.parametrize("tilt_deg", [0.0, 10.0, 20.0])
+def test_land_stops_as_modelled_whatever_the_acceleration_at_its_beginning(release: Release, tilt_deg: float) -> None:
+    """With the required parameters."""
+    far_m, speed_m_s = drift_m(release, tilt_deg)
+    assert speed_m_s > 0.5
+    assert far_m <= StopModel(Safety(react_time_s=0.0)).distance_m(speed_m_s)
+
+
+def test_land_of_1_18_ends_the_acceleration_of_its_beginning_at_mpc_jerk_auto_only() -> None:
+    assert drift_m((1, 18), 20.0, MPC_JERK_AUTO=6.0)[0] > drift_m((1, 16), 20.0, MPC_JERK_AUTO=6.0)[0] + 0.5
 
 
 def test_a_landing_that_ends_before_the_estimate_expires_disarms() -> None:
