@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-import mujoco
-
 from companion.model.algebra import mat_vec, plus
 from companion.model.frames import quat_rotate
 from companion.model.types import Quat, Vec3
@@ -168,9 +166,12 @@ class Bar:
     def force_world_n(self, number: int) -> Vec3:
         """Return the force of a clamp on its handle, world frame; 0 while it holds none."""
         d, clamp = self._data, self._clamps[number]
-        rows = (d.efc_type[: d.nefc] == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & (d.efc_id[: d.nefc] == clamp)
-        force = d.efc_force[: d.nefc][rows].tolist()
-        return (-force[0], -force[1], -force[2]) if len(force) == 3 else (0.0, 0.0, 0.0)
+        of = d.efc_id[: d.ne].tolist()  # the first rows are those of equality constraints
+        if of.count(clamp) != 3:
+            return (0.0, 0.0, 0.0)
+        row = of.index(clamp)
+        x, y, z = d.efc_force[row : row + 3].tolist()
+        return (-x, -y, -z)
 
     def _watch_rotors(self, t_s: float) -> None:
         """A bar or a rotor in a turning rotor breaks it."""

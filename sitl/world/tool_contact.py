@@ -27,6 +27,7 @@ _WATCH_STEPS = 5
 """Physics steps between two measurements of the rotors' distance, and between two samples of the contact force."""
 _RIM_POINTS = 36
 _NO_MASS_KG = 1e-4
+_ROUNDING_M = 1e-6
 
 
 class ToolContact:
@@ -54,6 +55,7 @@ class ToolContact:
         angles = np.linspace(0.0, 2.0 * math.pi, _RIM_POINTS, endpoint=False)
         rim = vehicle.airframe.disk_radius_m * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
         self._disks_body_m = (np.array(layout.positions_body_m)[:, None, :] + rim[None]).reshape(-1, 3)
+        self._reach_m = float(np.linalg.norm(self._disks_body_m, axis=1).max())
         self.touches = 0
         """Number of touches of any surface by the tip."""
         self.touched_s: float | None = None
@@ -64,7 +66,8 @@ class ToolContact:
         self.force_max_n = 0.0
         self._forces_n: list[Vec3] = []
         self.rotor_distance_m = self.rotor_distance_min_m = math.inf
-        """Smallest distance of a rotor's disk from a surface, now and so far; 0 or less if a rotor touches it."""
+        """Smallest distance of a rotor's disk from a surface, now and so far; 0 or less if a rotor touches it. That of now is measured
+        where it may be the smallest so far."""
         self._last_touch_s = -math.inf
         self._step = 0
 
@@ -114,9 +117,18 @@ class ToolContact:
                 self._events.report(t_s, "gave_way")
             if self._step % _WATCH_STEPS == 0:
                 self._forces_n.append(force_n)
-        if self._step % _WATCH_STEPS == 0:
+        if self._step % _WATCH_STEPS == 0 and self._may_be_nearest(q):
             self._measure_rotors(q)
         self._step += 1
+
+    def _may_be_nearest(self, q: Sequence[float]) -> bool:
+        """Return whether a rotor may be nearer to a surface than ever before: its plane is not that far from the whole vehicle."""
+        least_m, at_m = max(self.rotor_distance_min_m, 0.0) + self._reach_m + _ROUNDING_M, (q[0], q[1], q[2])
+        return any(
+            placed.local_m(at_m)[2] < least_m
+            for placed, gone in zip(self.surfaces.placed, self.surfaces.gone, strict=True)
+            if not gone
+        )
 
     def _measure_rotors(self, q: Sequence[float]) -> None:
         rotation = np.empty(9)
