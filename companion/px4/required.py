@@ -325,8 +325,8 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         Wanted(
             "MPC_JERK_AUTO",
             80.0,
-            "jerk, m/s^3, at which LAND of PX4 1.18 ends the acceleration that it begins with; with PX4's default of 4 it flies metres "
-            "past its stop point",
+            "jerk, m/s^3, at which LAND of PX4 1.18 ends the acceleration that it begins with; with 6, it flies metres past its "
+            "stop point",
             limits=(60.0, 80.0),
         ),
         Wanted(
