@@ -23,6 +23,7 @@ from companion.config.device_plugins import device_class
 from companion.config.devices import MocapDevice
 from companion.config.document import ConfigError
 from companion.config.loader import load_vehicle
+from companion.config.safety import Safety
 from companion.guardian import process
 from companion.guardian.mocap import GuardianMocap
 from companion.io.mocap.contained import ContainedClient
@@ -34,6 +35,7 @@ from companion.model.types import MocapPose
 from companion.plugins import MOCAP_SYSTEMS
 from companion.runtime import event_loop
 from companion.runtime.clock import flight_clock, monotonic
+from companion.safety.mocap import limits_of
 from companion.testing import check_mocap
 from tests.guardian.rig import Cameras
 from tests.plugins.installed import on_path, write_distribution
@@ -343,7 +345,8 @@ def test_the_guardian_lands_while_a_client_replaces_its_socket(monkeypatch: pyte
     link = Mock(poses_sent=0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as wire, socket.socket() as channel:
         link.wire.fileno, link.wire.lost = wire.fileno, False
-        guardian = process.Guardian(Mock(autopilot_address="udpin://127.0.0.1:1"), Mock(), channel, Mock())
+        settings = Mock(autopilot_address="udpin://127.0.0.1:1", pose_limits=limits_of(Safety()))
+        guardian = process.Guardian(settings, Mock(), channel, Mock())
         client = GuardianMocap(settings_of(MocapDevice(type="reconnecting", server="server", rigid_body_id=1)))
         client.close()
         guardian._mocap = client
