@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from companion.model.codec import Record
 
-MARKERS_MAX = 8
+MARKERS_MAX = 32
 """Number of markers of a frame that are kept: those nearest to the vehicle."""
 
 

@@ -131,7 +131,7 @@ async def test_y_up_markers_are_turned_as_poses_are() -> None:
 @pytest.mark.parametrize("up_axis", ["y", "z"])
 async def test_of_many_markers_the_nearest_to_the_vehicle_are_kept(up_axis: str) -> None:
     x, y, z = POSE.position_m
-    near = [(x, y, z + 0.125 * k) for k in range(MARKERS_MAX)]
+    near = [(x, y, z + k / MARKERS_MAX) for k in range(MARKERS_MAX)]
     far = [(x + 2.0, y + 2.0, z), (x - 2.0, y, z - 1.0)]
     for single in ([*far, *near], [*near, *far]):
         frame, _ = await received(single, ball=MARKER, up_axis=up_axis)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from companion.config.loader import load_flight
 from companion.control.arm_model import manipulator_of
+from companion.io.mocap.markers import marker_frame
 from companion.mission.air import Air, Observation
 from companion.mission.check import check_mission
 from companion.mission.phase import phases_of
@@ -22,7 +23,7 @@ from companion.mission.plan import Plan
 from companion.mission.segments import Segment
 from companion.model.constants import GRAVITY_M_S2, TICK_PERIOD_S
 from companion.model.frames import quat_from_euler_zyx, quat_rotate
-from companion.model.markers import Marker, MarkerFrame
+from companion.model.markers import MarkerFrame
 from companion.model.types import Inputs, OperatorCommand, Reference, Vec3, VehicleState
 from companion.phases.intercept import ball, choice, phase
 from companion.phases.intercept.ball import Candidate
@@ -82,12 +83,12 @@ def frames(
         t_s = number * TICK_PERIOD_S
         seen = [where(t_s) for where in places]
         markers = [
-            Marker((x + draw.gauss(0.0, NOISE_M), y + draw.gauss(0.0, NOISE_M), z + draw.gauss(0.0, NOISE_M)))
+            (x + draw.gauss(0.0, NOISE_M), y + draw.gauss(0.0, NOISE_M), z + draw.gauss(0.0, NOISE_M))
             for x, y, z in (at for at in seen if at is not None)
             if draw.random() > 0.03 and not lost(t_s)
         ]
         draw.shuffle(markers)
-        yield MarkerFrame(stamp_s=t_s + 0.004, exposed_s=t_s, frame_number=number, markers=tuple(markers))
+        yield marker_frame(t_s + 0.004, 0.004, number, markers, HOME.position_world_m)
 
 
 def followed(seen: Iterator[MarkerFrame]) -> Iterator[tuple[float, tuple[Candidate, ...]]]:
@@ -101,10 +102,15 @@ def still(at_m: Vec3) -> Where:
     return lambda t_s: at_m
 
 
-def flickering(draw: random.Random) -> Where:
-    """A reflection that is seen at another place in every 40 ms."""
+def flickering(draw: random.Random, lasts_s: float = 0.02, begins_s: float = 0.0) -> Where:
+    """A reflection that is seen again and again, each time at another place."""
     places = [(draw.uniform(-2.0, 2.0), draw.uniform(-2.0, 2.0), draw.uniform(0.0, 2.0)) for _ in range(100)]
-    return lambda t_s: places[int(t_s / 0.04)] if int(t_s / 0.02) % 2 else None
+
+    def where(t_s: float) -> Vec3 | None:
+        number = int((t_s + begins_s) / lasts_s)
+        return places[number // 2] if number % 2 else None
+
+    return where
 
 
 def swung(t_s: float) -> Vec3:
@@ -116,8 +122,15 @@ def swung(t_s: float) -> Vec3:
 THROWN = flight(NET_WORLD_M, (-3.0, 0.3, -2.0), 0.6)
 
 
-def test_a_ball_is_found_among_reflections_within_0_12_s_and_nothing_else_is_one() -> None:
-    others = [still((1.8, -1.5, 0.05)), flickering(random.Random(3)), flickering(random.Random(4))]
+@pytest.mark.parametrize(
+    "others",
+    [
+        [still((1.8, -1.5, 0.05)), flickering(random.Random(3)), flickering(random.Random(4))],
+        [flickering(random.Random(number), 0.05 + 0.005 * number, 0.01 * number) for number in range(40)],
+    ],
+    ids=["few", "many"],
+)
+def test_a_ball_is_found_among_reflections_within_0_12_s_and_nothing_else_is_one(others: list[Where]) -> None:
     found: dict[str, float] = {}
     for t_s, candidates in followed(frames([THROWN, *others], 0.55)):
         for candidate in candidates:
