@@ -31,6 +31,8 @@ _SIZE_MAX_BYTES = 2500
 _READ_LIMIT_S = 1.0
 """Limit of simulated time for one cycle."""
 _OPEN_LIMIT_S = 30.0
+_CLOCK_S = 5e-6
+"""Time that a look at the clock takes: code that only looks at it does not hang."""
 _REPLACE, _BEFORE, _BEHIND, _SILENCE = range(4)
 _READ, _OPEN, _BABBLE = range(3)
 """First byte of an input: answers to a flight's read; damage to the answers while the bus is opened; a line that never falls silent."""
@@ -92,6 +94,7 @@ class MemoryPort(ServoPort):
         return data
 
     def getCurrentTime(self) -> float:
+        self.ser.now_s += _CLOCK_S
         now_ms: float = self.ser.now_s * 1e3
         return now_ms
 

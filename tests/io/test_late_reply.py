@@ -1,4 +1,6 @@
-"""Replies that arrive after their timeout: the real dynamixel-sdk and bus code on a port in memory, in simulated time."""
+"""Replies that arrive after their timeout, and servos that send without pause: the real dynamixel-sdk and bus code on a port in memory,
+in simulated time.
+"""
 
 from __future__ import annotations
 
@@ -39,6 +41,9 @@ class LateSerial(MemorySerial):
     def read(self, size: int) -> bytes:
         while self.coming and self.coming[0][0] <= self.now_s:
             self._waiting += self.coming.pop(0)[1]
+        if not self._waiting and self.coming and self.coming[0][0] < self.now_s + 1e-3:
+            self.now_s = self.coming[0][0]
+            return self.read(size)
         return super().read(size)
 
 
@@ -87,3 +92,37 @@ def test_a_late_reply_to_a_read_does_not_confirm_that_torque_is_off() -> None:
     line.coming += [(line.now_s, status(servo_id, 0, bytes(dxl.BLOCK_SIZE))) for servo_id in IDS]
     line.coming += [(line.now_s + 1e-3, status(servo_id, 0, bytes(dxl.BLOCK_SIZE))) for servo_id in IDS]
     assert bus._confirmed(dxl.TORQUE_ENABLE, 0) == []
+
+
+@pytest.mark.parametrize("pause_s", [4e-5, 3e-4, 9e-4], ids=["without pause", "0.3 ms", "0.9 ms"])
+@pytest.mark.parametrize(
+    "packet", [status(IDS[0], 0, b"12345"), status(99, 0)], ids=["of another length", "of another id"]
+)
+def test_a_servo_that_sends_without_pause_delays_a_transaction_no_longer_than_a_silent_one(
+    packet: bytes, pause_s: float
+) -> None:
+    """A read in flight took 0.3 s, in which no torque was sent and the bus watchdogs tripped; a broadcast ping took 16 s."""
+
+    def of_reads(babble: bytes) -> list[float]:
+        bus, line = opened(-1)
+        line.answer = lambda sent: b""
+        took_s: list[float] = []
+        for transaction in (bus.read, lambda: bus._confirmed(dxl.TORQUE_ENABLE, 0), bus._servos.ping_all):
+            start_s = line.now_s
+            line.coming = [(start_s + k * pause_s, babble) for k in range(round(2.0 / pause_s))] if babble else []
+            assert not transaction()
+            took_s.append(line.now_s - start_s)
+        return took_s
+
+    for babbling_s, silent_s in zip(of_reads(packet), of_reads(b""), strict=True):
+        assert babbling_s < 1.5 * silent_s
+
+
+def test_a_read_in_flight_skips_the_late_reply_to_another_request() -> None:
+    """The first bytes of a longer reply were taken for the joint's state, and a shorter one failed the read."""
+    bus, line = opened(-1)
+    answered = line.answer
+    expected = bus.read()
+    for data in (b"", bytes(range(1, 2 * dxl.BLOCK_SIZE))):
+        line.answer = lambda sent, data=data: status(IDS[0], 0, data) + answered(sent)  # type: ignore[misc]
+        assert bus.read() == expected is not None

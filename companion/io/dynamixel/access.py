@@ -24,7 +24,7 @@ ERROR_NUMBER: Final = 0x7F
 _CRC_ERROR: Final = 3
 _PING, _READ = 0x01, 0x02
 _MODEL_AND_FIRMWARE_BYTES: Final = 3
-_ID, _LENGTH, _INSTRUCTION, _ERROR, _READ_SIZE = 4, slice(5, 7), 7, 8, slice(10, 12)
+_ID, _LENGTH, _INSTRUCTION, _ERROR, _DATA, _READ_SIZE = 4, slice(5, 7), 7, 8, 9, slice(10, 12)
 """Places in a packet."""
 _BESIDE_DATA_BYTES: Final = 4
 """Bytes that a status packet's length counts beside the data: instruction, error and CRC."""
@@ -38,10 +38,21 @@ class _Protocol(Protocol2PacketHandler):  # type: ignore[misc]
     def txRxPacket(self, port: ServoPort, txpacket: list[int]) -> tuple[list[int] | None, int, int]:
         """Send a request and return its reply; skip status packets that have more or less data than the reply has."""
         reply, result, error = super().txRxPacket(port, txpacket)
-        while result == COMM_SUCCESS and reply is not None and not _replies(reply, txpacket):
+        instruction, reads = txpacket[_INSTRUCTION], txpacket[_INSTRUCTION] == _READ
+        size = _word(txpacket[_READ_SIZE]) if reads else _MODEL_AND_FIRMWARE_BYTES if instruction == _PING else 0
+        while result == COMM_SUCCESS and reply is not None and not _replies(reply, txpacket[_ID], size, reads):
             reply, result = self.rxPacket(port, False)
             error = reply[_ERROR] if result == COMM_SUCCESS else 0
         return reply, result, error
+
+    def readRx(self, port: ServoPort, dxl_id: int, length: int) -> tuple[list[int], int, int]:
+        """Return the data of a servo's reply to a read; skip other status packets as `txRxPacket` does."""
+        while True:
+            reply, result = self.rxPacket(port, False)
+            if result != COMM_SUCCESS:
+                return [], result, 0
+            if _replies(reply, dxl_id, length, True):
+                return reply[_DATA : _DATA + length], result, reply[_ERROR]
 
 
 class ServoAccess:
@@ -160,13 +171,11 @@ def _arrived(result: int, error: int) -> bool:
     return bool(result == COMM_SUCCESS and error & ERROR_NUMBER != _CRC_ERROR)
 
 
-def _replies(reply: list[int], request: list[int]) -> bool:
-    """Return whether a status packet comes from the servo of the request and has the data of its reply, or refuses a read."""
-    reads = request[_INSTRUCTION] == _READ
-    size = _word(request[_READ_SIZE]) if reads else {_PING: _MODEL_AND_FIRMWARE_BYTES}.get(request[_INSTRUCTION], 0)
+def _replies(reply: list[int], servo_id: int, size: int, reads: bool) -> bool:
+    """Return whether a status packet comes from the servo and has so many bytes of data, or refuses a read."""
     found = _word(reply[_LENGTH]) - _BESIDE_DATA_BYTES
     refused = reads and found == 0 and reply[_ERROR] & ERROR_NUMBER
-    return reply[_ID] == request[_ID] and bool(found == size or refused)
+    return reply[_ID] == servo_id and bool(found == size or refused)
 
 
 def _word(two: list[int]) -> int:

@@ -18,9 +18,8 @@ from companion.runtime import simulated_time
 from companion.runtime.simulated_time import SimulatedTime
 
 _POLL_MS = 1.0
-_NOISE_PATIENCE = 20.0
-NOISE_BYTES = 4096
-"""More bytes than the replies to any one instruction: 252 servos answer a broadcast ping with 14 bytes each."""
+NOISE_BYTES = 252 * 14
+"""As many bytes as the longest replies to one instruction: those of 252 servos to a broadcast ping."""
 _LOOK_S = 0.001
 """Longest wait in simulated time without asking whether a reply is still to come."""
 
@@ -28,15 +27,17 @@ _LOOK_S = 0.001
 class ServoPort(PortHandler):  # type: ignore[misc]
     """The SDK's port with a serial timeout (the original busy-polls while holding the GIL), a lock, and its own packet timeout.
 
-    A reply times out only if the process spent most of the timeout waiting at the port: a process that was not scheduled for a while
-    reads the port again before it gives up.
+    A reply times out only if the process spent half of the timeout waiting at the port or reading other bytes than the reply's: a
+    process that was not scheduled for a while reads the port again before it gives up, and a servo that sends without pause does not
+    keep it reading.
     """
 
     is_open: bool
     _arrived = b""
     """Bytes that were read from the port and not yet asked for by the SDK, which reads the head of a packet before the rest."""
     _waited_ms = 0.0
-    _taken_bytes = 0
+    _surplus_bytes = 0
+    """Bytes that were read beyond those of the reply; negative while the reply is not complete."""
     _reply_missing = False
     reply_timeout_ms = 100.0
     """Longest wait for a reply, in addition to the transmission time of its bytes."""
@@ -90,13 +91,14 @@ class ServoPort(PortHandler):  # type: ignore[misc]
     def setPacketTimeout(self, packet_length: int) -> None:
         """Start the timeout for `packet_length` bytes."""
         self.setPacketTimeoutMillis(self.tx_time_per_byte * packet_length + self.reply_timeout_ms)
+        self._surplus_bytes = -packet_length
 
     def setPacketTimeoutMillis(self, msec: float) -> None:
         """Start a timeout of `msec`."""
         self.packet_start_time = self.getCurrentTime()
         self.packet_timeout = msec
         self._waited_ms = 0.0
-        self._taken_bytes = 0
+        self._surplus_bytes = 0
 
     def clearPort(self) -> None:
         """Discard the bytes that have arrived; after a timeout, also wait for a late reply and discard it. The SDK calls this before
@@ -119,14 +121,12 @@ class ServoPort(PortHandler):  # type: ignore[misc]
         Raises:
             OSError: the port is gone.
         """
-        if self._taken_bytes > NOISE_BYTES:
-            return b""  # the SDK checks the time only when it lacks bytes: endless noise would keep it reading for ever
+        if self.isPacketTimeout():
+            return b""  # the SDK checks the time only when it lacks bytes: packets without pause would keep it reading
         if not self._arrived:
-            self._arrived = self._receive()
-            if not self._arrived:
-                self._waited_ms += _POLL_MS
+            self._wait()
         data, self._arrived = self._arrived[:length], self._arrived[length:]
-        self._taken_bytes += len(data)
+        self._surplus_bytes += len(data)
         return data
 
     def peek(self, length: int) -> bytes:
@@ -136,16 +136,18 @@ class ServoPort(PortHandler):  # type: ignore[misc]
             OSError: the port is gone.
         """
         if len(self._arrived) < length:
-            more = self._receive()
-            self._arrived += more
-            if not more:
-                self._waited_ms += _POLL_MS
+            self._wait()
         return self._arrived[:length]
 
     def skip(self, length: int) -> None:
         """Take the bytes that `peek` returned."""
         self._arrived = self._arrived[length:]
-        self._taken_bytes += length
+        self._surplus_bytes += length
+
+    def _wait(self) -> None:
+        start_ms = self.getCurrentTime()
+        self._arrived += self._receive()
+        self._waited_ms += min(_POLL_MS, self.getCurrentTime() - start_ms)
 
     def _receive(self) -> bytes:
         """Return all bytes that have arrived, after a wait of at most 1 ms; empty if none have. pyserial's `read` takes only the bytes
@@ -173,10 +175,9 @@ class ServoPort(PortHandler):  # type: ignore[misc]
 
     def isPacketTimeout(self) -> bool:
         """Return whether the reply has timed out."""
-        elapsed_ms = self.getTimeSinceStart()
-        noise = elapsed_ms > _NOISE_PATIENCE * self.packet_timeout or self._taken_bytes > NOISE_BYTES
-        silence = elapsed_ms > self.packet_timeout and self._waited_ms > 0.5 * self.packet_timeout
-        self._reply_missing = noise or silence
+        listened_ms = self._waited_ms + self.tx_time_per_byte * max(0, self._surplus_bytes)
+        late = self.getTimeSinceStart() > self.packet_timeout and listened_ms > 0.5 * self.packet_timeout
+        self._reply_missing = late or self._surplus_bytes >= NOISE_BYTES
         return self._reply_missing
 
 
@@ -211,7 +212,7 @@ class SimulatedPort(ServoPort):
 
     def isPacketTimeout(self) -> bool:
         """Return whether no reply will arrive."""
-        return self._silent or self._taken_bytes > NOISE_BYTES
+        return (self._silent and not self._arrived) or self._surplus_bytes >= NOISE_BYTES
 
     def _receive(self) -> bytes:
         while True:
