@@ -11,9 +11,10 @@ from typing import Any, Final
 import numpy as np
 
 from companion.analysis.log import FlightLog, LogError
+from companion.analysis.tables import TOPICS, cells_of, pieces_of, tables_of
 from companion.model.constants import TICK_PERIOD_S
 from companion.model.units import unit_of
-from companion.runtime.files import write_whole
+from companion.runtime.files import whole_file, write_whole
 
 ABOUT = "columns.json"
 """File beside the tables: for each table its rate, and for each column its unit and frame."""
@@ -33,18 +34,17 @@ def about_column(name: str) -> dict[str, str | None]:
 
 
 def write_tables(log: FlightLog, out: Path, suffix: str) -> list[Path]:
-    """Write the tables of `FlightLog.to_pandas` and `ABOUT`; return the paths.
+    """Write the tables of `FlightLog.to_pandas`, with every tick, and `ABOUT`; return the paths.
 
     Args:
         out: folder, which is made.
         suffix: `csv` or `parquet`.
 
     Raises:
-        LogError: pandas is not installed.
-        ImportError: pyarrow is not installed, and the suffix is `parquet`.
+        ImportError: pandas is not installed, or pyarrow for the suffix `parquet`.
         OSError: a file cannot be written.
     """
-    tables = log.to_pandas()
+    tables = tables_of(log.every_tick)
     out.mkdir(parents=True, exist_ok=True)
     about: dict[str, Any] = {
         "log": log.path.name,
@@ -54,7 +54,8 @@ def write_tables(log: FlightLog, out: Path, suffix: str) -> list[Path]:
     written = []
     for topic, table in tables.items():
         path = out / f"{topic.removeprefix('/')}.{suffix}"
-        write_whole(path, table.to_csv().encode() if suffix == "csv" else table.to_parquet())
+        with whole_file(path) as file:
+            table.write(file, suffix)
         about["tables"][path.name] = {
             "rate_hz": None if topic == "/events" else round(1.0 / TICK_PERIOD_S),
             "columns": {name: about_column(name) for name in table.columns},
@@ -79,6 +80,7 @@ _VECTORS = {
     "action": (("/outputs", "attitude.attitude_wxyz"), ("/outputs", "attitude.thrust"), ("/outputs", "arm_torque_nm")),
 }
 """Features of a dataset, and the fields of the log that they hold."""
+_PLACES = {place for places in _VECTORS.values() for place in places}
 
 
 def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
@@ -126,7 +128,7 @@ def write_lerobot(logs: Sequence[FlightLog], out: Path) -> int:
             **dict(zip(_INDICES, (frames, frames * 0 + number, frames + begun, frames * 0 + task), strict=True)),
         }
         place = {"chunk_index": number // _CHUNK, "file_index": number % _CHUNK}
-        _write_parquet(out / _DATA.format(**place), {key: list(value) for key, value in {**vectors, **scalars}.items()})
+        _write_frames(out / _DATA.format(**place), {**vectors, **scalars})
         every.append({**vectors, **{key: value[:, None] for key, value in scalars.items()}})
         described.append(
             {
@@ -176,6 +178,21 @@ def _write_json(path: Path, content: Any) -> None:
     write_whole(path, f"{json.dumps(content, indent=1)}\n".encode())
 
 
+def _write_frames(path: Path, columns: dict[str, Any]) -> None:
+    import pyarrow
+    from pyarrow import parquet
+
+    def column(values: Any) -> Any:
+        if values.ndim == 1:
+            return pyarrow.array(values)
+        offsets = np.arange(len(values) + 1, dtype=np.int32) * values.shape[1]
+        return pyarrow.ListArray.from_arrays(pyarrow.array(offsets), pyarrow.array(values.ravel()))
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(path) as file:
+        parquet.write_table(pyarrow.table({key: column(values) for key, values in columns.items()}), file)
+
+
 def _write_parquet(path: Path, columns: dict[str, Any], index: Sequence[str] | None = None) -> None:
     import pandas
 
@@ -187,13 +204,26 @@ def _episode(log: FlightLog) -> dict[str, Any]:
     """Return a table for each feature, with the ticks in which every field is known."""
     import pandas
 
-    tables = log.to_pandas()
     fields = [(key, topic, field) for key, places in _VECTORS.items() for topic, field in places]
+    pieces = []
+    for rows in pieces_of(log.every_tick()):
+        ticks = [
+            {
+                (topic, name): value
+                for topic, record in zip(TOPICS, row, strict=True)
+                for name, value in cells_of(record).items()
+                if (topic, name.partition("[")[0]) in _PLACES and value is not None
+            }
+            for row in rows
+        ]
+        index = pandas.Index([row[0].t_s for row in rows], name="t_s", dtype=float)
+        pieces.append(pandas.DataFrame(ticks, index=index, dtype=np.float32))
+    table = pandas.concat(pieces) if pieces else pandas.DataFrame()
     found = {
-        (key, column): tables[topic][column]
+        (key, name): table[(of, name)]
         for key, topic, field in fields
-        for column in tables[topic].columns
-        if column.partition("[")[0] == field and tables[topic][column].notna().any()
+        for of, name in table.columns
+        if (of, name.partition("[")[0]) == (topic, field)
     }
     frames = pandas.DataFrame(found).dropna()
     if frames.empty or {key for key, _ in found} != set(_VECTORS):

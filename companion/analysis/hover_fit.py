@@ -8,6 +8,7 @@ fit therefore balances sums over time, in which the noise cancels (instrumental 
 from __future__ import annotations
 
 import math
+from array import array
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,7 +69,7 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
         HoverFitError: less than `FIT_MIN_S` of steady flight under the control law, or no mass in the log's configuration.
     """
     airframe = (log.config.get("vehicle") or {}).get("airframe") or {}
-    samples = _calm(log)
+    samples, learnt = _calm(log)
     dt_s, thrust, load, voltage_v = samples.T
     used_s = float(dt_s.sum())
     if used_s < FIT_MIN_S:
@@ -85,33 +86,36 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
             instruments = np.stack([np.ones(len(load)), voltage_v - mean_v], axis=1)
             values, errors = _fit(dt_s, instruments * load[:, None], instruments, thrust, pieces)
             slope = VoltageSlope(float(values[1]), float(errors[1]))
-    learnt = [o.control.hover_thrust for o in log.outputs if o.control is not None]
     return HoverFit(
         hover_thrust=float(values[0]),
         standard_error=float(errors[0]),
         used_s=used_s,
         configured=airframe.get("hover_thrust"),
-        last_estimate=learnt[-1] if learnt else None,
+        last_estimate=learnt,
         voltage_mean_v=mean_v,
         voltage_span_v=span_v,
         slope=slope,
     )
 
 
-def _calm(log: FlightLog) -> Array:
-    """Return the ticks of steady flight, (N, 4): duration s, normalised thrust, load over weight, battery voltage V or NaN."""
+def _calm(log: FlightLog) -> tuple[Array, float | None]:
+    """Return the ticks of steady flight, (N, 4): duration s, normalised thrust, load over weight, battery voltage V or NaN; and the
+    last estimate of the hover thrust.
+    """
     vehicle = log.config.get("vehicle") or {}
     mass_kg = (vehicle.get("airframe") or {}).get("mass_kg")
     force_timeout_s = (vehicle.get("safety") or {}).get("force_timeout_s", 0.25)
     if mass_kg is None:
         raise HoverFitError(f"{log.path}: no vehicle.airframe.mass_kg in its configuration; expected a flight log")
     balance = Balance(mass_kg)
-    rows: list[tuple[float, float, float, float]] = []
+    rows = array("d")
+    learnt: float | None = None
     acceleration = MeanAcceleration()
     sent: float | None = None
     before_s: float | None = None
     carrying = False
-    for i, o, _ in log.rows():
+    for i, o, _ in log.every_tick():
+        learnt = learnt if o.control is None else o.control.hover_thrust
         dt_s = 0.0 if before_s is None else i.t_s - before_s
         before_s = i.t_s
         carrying = carrying or any(event.id == "catch" for event in o.events)
@@ -121,9 +125,9 @@ def _calm(log: FlightLog) -> Array:
             blind = i.force is None or i.t_s - i.force.stamp_s > force_timeout_s
             if now is not None and o.phase_kind is PhaseKind.FLIGHT and not (carrying and blind):
                 voltage_v = i.status.battery_voltage_v if i.status is not None else None
-                rows.append((dt_s, *now, math.nan if voltage_v is None else voltage_v))
+                rows.extend((dt_s, *now, math.nan if voltage_v is None else voltage_v))
         sent = o.attitude.thrust if o.attitude is not None else None
-    return np.array(rows, dtype=np.float64).reshape(len(rows), 4)
+    return np.array(rows).reshape(-1, 4), learnt
 
 
 def _fit(dt_s: Array, columns: Array, instruments: Array, thrust: Array, pieces: Array) -> tuple[Array, Array]:

@@ -10,7 +10,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
 from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
@@ -19,8 +18,8 @@ from zstandard import ZstdError
 
 from companion import DISTRIBUTION
 from companion.analysis.columns import Columns, array_of, columns_of
-from companion.analysis.flat import flat
 from companion.analysis.logged_config import checked_config, checked_path
+from companion.analysis.tables import TOPICS, cells_of
 from companion.analysis.timing import Array as Array
 from companion.analysis.timing import Stopwatch, Timing, timing_of
 from companion.config.loader import FlightConfig, logged_flight
@@ -30,12 +29,12 @@ from companion.model.outputs import Outputs, Sent
 from companion.model.types import Inputs
 from companion.plugins import PluginError
 
-_RECORDS: dict[str, type] = {"/inputs": Inputs, "/outputs": Outputs, "/sent": Sent}
+TICKS_KEPT = 20_000
+"""Ticks that commands keep in memory which need every tick: they read a longer log again, tick by tick."""
+_RECORDS: dict[str, type] = dict(zip(TOPICS, (Inputs, Outputs, Sent), strict=True))
 _TORN = "/inputs, /outputs and /sent hold different ticks"
 Row = tuple[Inputs, Outputs, Sent]
 """A tick."""
-_TOPICS = tuple(_RECORDS)
-"""Topics in the order of a tick's records in the file."""
 _FORMER_NAMES = (
     (b'"bent_by"', b'"limited_by"'),
     (b'"mode":"weigh"', b'"mode":"tare"'),
@@ -77,10 +76,11 @@ class FlightLog:
         return self.metadata.get("flight", {}).get("clock", "real")
 
     @staticmethod
-    def read(path: Path, *, ticks_max: int | None = None) -> FlightLog:
+    def read(path: Path, *, ticks_max: int | None = None, part: range | None = None) -> FlightLog:
         """Read a log.
 
         Args:
+            part: keep only the ticks of these numbers, and those with an outcome. None keeps all.
             ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes about 9 kB of
                 memory. None keeps all.
 
@@ -91,7 +91,8 @@ class FlightLog:
         """
         reading, rows = _Reading(path), _Rows(ticks_max)
         for row in reading.ticks():
-            rows.take(row)
+            if part is None or row[0].tick in part or row[1].outcome is not None:
+                rows.take(row)
         log = FlightLog(
             path=path,
             inputs=tuple(row[0] for row in rows.kept),
@@ -215,12 +216,12 @@ class FlightLog:
         ticks_s = [inputs.t_s for inputs in self.inputs]
         events = [(event, outputs.mission_time_s(event)) for outputs in self.outputs for event in outputs.events]
         tables = {
-            "/inputs": (ticks_s, map(_cells, self.inputs)),
-            "/outputs": (ticks_s, map(_cells, self.outputs)),
-            "/sent": (ticks_s, map(_cells, self.sent)),
+            "/inputs": (ticks_s, map(cells_of, self.inputs)),
+            "/outputs": (ticks_s, map(cells_of, self.outputs)),
+            "/sent": (ticks_s, map(cells_of, self.sent)),
             "/events": (
                 [event.t_s for event, _ in events],
-                ({**_cells(event), "mission_t_s": t} for event, t in events),
+                ({**cells_of(event), "mission_t_s": t} for event, t in events),
             ),
         }
         return {
@@ -232,15 +233,6 @@ class FlightLog:
     def columns(self) -> Columns:
         """Return the quantities that metrics and plots share, as arrays."""
         return columns_of(self.rows(), self.joint_count)
-
-
-def _cells(record: Any) -> dict[str, Any]:
-    """Return the values of a record and of the records in it, except `t_s` and `events`, keyed by column name."""
-    fields = {key: value for key, value in msgspec.to_builtins(record).items() if key not in ("t_s", "events")}
-    cells = flat(fields, lambda values: not all(isinstance(value, str) for value in values))
-    return {
-        name: ", ".join(value) if isinstance(value, list | tuple) else value for name, value in cells if value != {}
-    }
 
 
 class _Reading:
@@ -267,10 +259,10 @@ class _Reading:
                         for former, name in _FORMER_NAMES:
                             data = data.replace(former, name)
                         part: Any = from_json(_RECORDS[topic], data)
-                        if topic != _TOPICS[len(row)] or (row and part.tick != row[0].tick):
+                        if topic != TOPICS[len(row)] or (row and part.tick != row[0].tick):
                             raise ValueError(_TORN)
                         row.append(part)
-                        if len(row) == len(_TOPICS):
+                        if len(row) == len(TOPICS):
                             inputs, outputs, sent = row
                             row = []
                             for t_s in (inputs.t_s, outputs.t_s):

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from companion import __version__
-from companion.analysis.log import FlightLog, LogError, writer
+from companion.analysis.log import TICKS_KEPT, FlightLog, LogError, writer
 from companion.model.codec import differences, fingerprint, from_packet, to_packet
 from companion.model.outputs import Outputs, Sent
 from companion.model.types import Inputs
@@ -25,10 +25,6 @@ OLDER_FINGERPRINTS = (
     "1210f8bc9eeae0e5",  # before clamp errors, and what members of a team compare: `AutopilotStatus.system_id`, `TeamState.agreed`
 )
 """Fingerprints of records that lack only fields that have a default now."""
-
-
-_TICKS_MAX = 20_000
-"""Ticks of a log that are kept in memory; a longer log is read twice, which takes a sixth more time."""
 
 
 class Core(Protocol):
@@ -157,7 +153,7 @@ def flight_core(config_json: str) -> Core:
 def run(path: Path) -> int:
     """Run `companion replay FILE`: 0 if every output is bit-identical, 1 if not, 2 if the log cannot be replayed."""
     try:
-        result = replay(FlightLog.read(path, ticks_max=_TICKS_MAX), flight_core)
+        result = replay(FlightLog.read(path, ticks_max=TICKS_KEPT), flight_core)
     except LogError as error:
         print(error, file=sys.stderr)
         return 2

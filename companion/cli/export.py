@@ -8,11 +8,14 @@ from typing import Any
 
 from companion import DISTRIBUTION
 from companion.analysis.export import write_lerobot, write_tables
-from companion.analysis.log import FlightLog, LogError
+from companion.analysis.log import TICKS_KEPT, FlightLog, LogError
 from companion.cli.report import names_of
 from companion.config.document import ConfigError
 from companion.model.exit_codes import EXIT_OK
 from companion.recorder.viewer_file import write_viewer_file
+
+_TICKS_MIN = 500
+"""Ticks of each of many logs that are kept in memory."""
 
 
 def add_parser(commands: Any) -> None:
@@ -42,11 +45,12 @@ def run(arguments: argparse.Namespace) -> int:
     """
     paths: list[Path] = arguments.log
     out: Path | None = arguments.out
+    ticks_max = max(_TICKS_MIN, TICKS_KEPT // len(paths))
     try:
         if arguments.format == "lerobot":
             if out is None:
                 raise ConfigError("companion export: --format lerobot needs --out, the folder of the dataset")
-            frames = write_lerobot([FlightLog.read(path) for path in paths], out)
+            frames = write_lerobot([FlightLog.read(path, ticks_max=ticks_max) for path in paths], out)
             print(f"{out}: {len(paths)} episodes, {frames} frames")
             return EXIT_OK
         if arguments.format == "foxglove":
@@ -55,13 +59,16 @@ def run(arguments: argparse.Namespace) -> int:
                     "companion export: --format foxglove needs --out, the file to write, such as both.mcap"
                 )
             out.parent.mkdir(parents=True, exist_ok=True)
-            logs = {name: FlightLog.read(path) for name, path in zip(names_of(paths), paths, strict=True)}
+            logs = {
+                name: FlightLog.read(path, ticks_max=ticks_max)
+                for name, path in zip(names_of(paths), paths, strict=True)
+            }
             write_viewer_file(logs, out)
             print(out)
             return EXIT_OK
         for path, name in zip(paths, names_of(paths), strict=True):
             folder = path.parent if out is None else out / name if len(paths) > 1 else out
-            for written in write_tables(FlightLog.read(path), folder, arguments.format):
+            for written in write_tables(FlightLog.read(path, ticks_max=TICKS_KEPT), folder, arguments.format):
                 print(written)
     except LogError as error:
         raise ConfigError(str(error)) from None

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.analysis.hover_fit import SLOPE_MIN_V, HoverFit, HoverFitError, fit_hover_thrust
-from companion.analysis.log import FlightLog, LogError
+from companion.analysis.log import TICKS_KEPT, FlightLog, LogError
 from companion.config.document import ConfigError
 from companion.model.exit_codes import EXIT_OK
 
@@ -32,7 +32,7 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     try:
-        log = FlightLog.read(arguments.log)
+        log = FlightLog.read(arguments.log, ticks_max=TICKS_KEPT)
         fit = fit_hover_thrust(log)
     except (LogError, HoverFitError) as error:
         raise ConfigError(str(error)) from None

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from companion.analysis.log import FlightLog, LogError
+from companion.analysis.log import LogError
 from companion.config.document import ConfigError
 from companion.config.shipped import FILES, named_file
 from companion.config.yaml_strict import read_document
@@ -46,10 +46,12 @@ def run(arguments: argparse.Namespace) -> int:
     """
     from companion.commissioning.identify.identification import identify
     from companion.commissioning.identify.proposal import HOVER_THRUST, vehicle_changes, world_text
+    from companion.commissioning.identify.samples import read_part
     from companion.commissioning.patch import propose
 
     try:
-        found = identify(FlightLog.read(arguments.log))
+        log, part = read_part(arguments.log)
+        found = identify(log)
     except LogError as error:
         raise ConfigError(str(error)) from None
     vehicle_file = _vehicle_file(arguments, found.flight.vehicle_file)
@@ -63,6 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     document = {
         "schema_version": 1,
         "log": str(arguments.log),
+        "ticks": None if part is None else [part.start, part.stop - 1],
         "quantities": [one.as_json() for one in found.quantities],
         "patch": patch.as_json() if patch else None,
         "world": str(folder / WORLD) if folder is not None else None,
@@ -73,6 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps({**document, "backup": str(backup) if backup else None}, allow_nan=False))
         return EXIT_OK
+    if part is not None:
+        print(f"long flight: ticks {part.start} to {part.stop - 1} were used")
     for one in found.quantities:
         print(one.line())
     print()

@@ -64,7 +64,7 @@ def _write(context: foxglove.Context, logs: Mapping[str, FlightLog], epochs_ns: 
 
 
 def _ticks(name: str, log: FlightLog, epoch_ns: int) -> Iterator[tuple[int, str, Inputs, Outputs]]:
-    for inputs, outputs, _ in log.rows():
+    for inputs, outputs, _ in log.every_tick():
         stamp_ns = epoch_ns + round(inputs.t_s * 1e9)
         if stamp_ns >= 0:
             yield stamp_ns, name, inputs, outputs

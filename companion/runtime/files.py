@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 
 def write_whole(
@@ -17,13 +19,32 @@ def write_whole(
     replace: bool = True,
     durable: bool = False,
 ) -> None:
-    """Write a file through a temporary file in the same folder, so that a failure leaves no partial file.
+    """Write a file as `whole_file` does.
+
+    Args:
+        durable: whether to wait until the content is on the storage medium, so that it survives a loss of power.
+
+    Raises:
+        FileExistsError: the file exists and `replace` is False; it is left unchanged.
+        OSError: the file cannot be written; an existing one is left unchanged.
+    """
+    with whole_file(path, mode=mode, owner=owner, replace=replace) as file:
+        file.write(data)
+        if durable:
+            file.flush()
+            os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def whole_file(
+    path: Path, *, mode: int | None = None, owner: tuple[int, int] | None = None, replace: bool = True
+) -> Iterator[IO[bytes]]:
+    """Open a temporary file in the same folder that becomes the file at the end, so that a failure leaves no partial file.
 
     Args:
         mode: permission bits; None for the default of the process (umask).
         owner: user and group id; None for those of the process.
         replace: False refuses to replace an existing file.
-        durable: whether to wait until the content is on the storage medium, so that it survives a loss of power.
 
     Raises:
         FileExistsError: the file exists and `replace` is False; it is left unchanged.
@@ -37,10 +58,7 @@ def write_whole(
                 os.fchown(file.fileno(), *owner)
             if mode is not None:
                 os.fchmod(file.fileno(), mode)
-            file.write(data)
-            if durable:
-                file.flush()
-                os.fsync(file.fileno())
+            yield file
         if replace:
             part.replace(path)
         else:

@@ -10,16 +10,22 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from companion.analysis import plot_style
-from companion.analysis.log import FlightLog
+from companion.analysis import plot_style, tables
+from companion.analysis.export import write_lerobot, write_tables
+from companion.analysis.hover_fit import fit_hover_thrust
+from companion.analysis.log import TICKS_KEPT, FlightLog
 from companion.analysis.metrics import catch_index
 from companion.analysis.replay import replay
 from companion.analysis.report import write_report
 from companion.analysis.summary import summarise
+from companion.cli.main import main
+from companion.commissioning.identify import samples
 from companion.launcher.run import TICKS_MAX
+from companion.model.exit_codes import EXIT_OK
 from companion.model.outputs import Outputs
 from companion.model.types import Inputs
 from companion.recorder.client import RecorderProcess
+from companion.recorder.viewer_file import write_viewer_file
 from tests.analysis.synthetic_flight import CONFIG, record_flight, synthetic_flight
 
 TICKS = 350
@@ -102,6 +108,64 @@ def test_a_replay_compares_every_tick_of_a_thinned_out_log(whole: FlightLog, thi
     other = replay(thin, lambda _: Recited(thinned_out)).first_difference
     assert other is not None
     assert (other.tick, other.field) == (thinned_out, "phase")
+
+
+def test_the_hover_thrust_is_fitted_to_every_tick_of_a_thinned_out_log(whole: FlightLog, thin: FlightLog) -> None:
+    assert fit_hover_thrust(thin) == fit_hover_thrust(whole)
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "lerobot", "foxglove"])
+def test_an_export_holds_every_tick_of_a_thinned_out_log(
+    whole: FlightLog, thin: FlightLog, form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pyarrow")
+    monkeypatch.setattr(tables, "_PIECE_ROWS", TICKS // 3)
+    written: dict[str, dict[str, bytes]] = {}
+    for name, log in (("whole", whole), ("thin", thin)):
+        out = tmp_path / name
+        out.mkdir()
+        match form:
+            case "lerobot":
+                write_lerobot([log], out)
+            case "foxglove":
+                write_viewer_file({"A": log}, out / "both.mcap")
+            case _:
+                write_tables(log, out, form)
+        written[name] = {str(file.relative_to(out)): file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    assert written["thin"] == written["whole"]
+
+
+def test_identification_reads_the_ticks_around_the_catch_of_a_long_flight(
+    path: Path, whole: FlightLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(samples, "TICKS_KEPT", TICKS)
+    log, part = samples.read_part(path)
+    caught = catch_index(whole)
+    assert caught is not None
+    assert part == range(caught - TICKS // 2, caught - TICKS // 2 + TICKS)
+    assert list(log.rows())[:TICKS] == list(whole.rows())[part.start : part.stop]
+    assert (len(log.inputs) - len(part), log.outputs[-1].outcome) == (1, whole.outputs[-1].outcome)
+    assert catch_index(log) == TICKS // 2
+
+
+@pytest.mark.parametrize(
+    "command", ["hover fit", "export --format csv", "export --format lerobot", "export --format foxglove"]
+)
+def test_the_commands_keep_a_part_of_a_long_log_in_memory(
+    command: str, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pyarrow")
+    limits: list[int | None] = []
+
+    def read(path: Path, *, ticks_max: int | None = None) -> FlightLog:
+        limits.append(ticks_max)
+        return read_log(path, ticks_max=TICKS)
+
+    read_log = FlightLog.read
+    monkeypatch.setattr(FlightLog, "read", staticmethod(read))
+    out = () if command == "hover fit" else ("--out", str(tmp_path / "out"))
+    assert main([*command.split(), str(path), *out]) == EXIT_OK
+    assert limits == [TICKS_KEPT]
 
 
 def test_the_report_of_a_long_flight_names_the_share_of_ticks_kept(

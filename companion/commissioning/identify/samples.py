@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.analysis.log import Array, FlightLog, LogError
+from companion.analysis.log import TICKS_KEPT, Array, FlightLog, LogError
 from companion.analysis.metrics import catch_index
 from companion.commissioning.identify.response import STEP_S
 from companion.config.vehicle import Vehicle
@@ -28,6 +28,23 @@ _GAP_MAX_S = 0.03
 
 
 Row = tuple[Inputs, Outputs, Sent]
+
+
+def read_part(path: Path) -> tuple[FlightLog, range | None]:
+    """Read a log. Of a long one, `TICKS_KEPT` ticks are kept, around the catch or from the takeoff on, and their numbers returned.
+
+    Raises:
+        LogError: see `FlightLog.read`.
+    """
+    log = FlightLog.read(path, ticks_max=TICKS_KEPT)
+    if log.stride == 1:
+        return log, None
+    caught = catch_index(log)
+    flown = next((i.tick for i, o, _ in log.rows() if o.phase_kind is not PhaseKind.GROUND), log.inputs[0].tick)
+    begin = flown if caught is None else max(flown, log.inputs[caught].tick - TICKS_KEPT // 2)
+    del log  # its memory is needed
+    part = range(begin, begin + TICKS_KEPT)
+    return FlightLog.read(path, part=part), part
 
 
 @dataclass(frozen=True)
