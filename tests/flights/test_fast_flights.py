@@ -15,13 +15,15 @@ from sitl.fast.result import FastResult
 from tests.flights.ends import after
 from tests.support import SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
 
 def configured(*overrides: str, preset: str = "recommended") -> SitlConfig:
     return load_sitl("configs/missions/catch.yaml", preset=preset, overrides=overrides)
 
 
 def short(*overrides: str) -> SitlConfig:
-    """Arming at 4.0 s, take-off at 5.2 s, the line at 6.7 s, the catch at 7.7 s, landing from 9.7 s on."""
+    """Take-off at 3.2 s, the line at 4.7 s, the catch at 5.7 s, landing from 7.7 s on."""
     return load_sitl(SHORT_CATCH, preset="recommended", overrides=overrides)
 
 
@@ -75,7 +77,7 @@ def assert_loads_stand_still_on_the_ground(result: FastResult) -> None:
 
 
 def test_the_same_seed_flies_the_same_flight_bit_for_bit() -> None:
-    first, again = (FastFlight(short()).run(limit_s=8.7) for _ in range(2))
+    first, again = (FastFlight(short()).run(limit_s=6.7) for _ in range(2))
     assert first.caught and again.outputs == first.outputs
     other = FastFlight(short("world.seed=2")).run(limit_s=2.0)
     assert other.outputs != first.outputs[: len(other.outputs)]
@@ -136,7 +138,7 @@ def test_a_delay_that_makes_the_control_law_swing_is_reported_and_px4_lands() ->
 
 def test_asked_to_land_it_lands() -> None:
     """In take-off. Asked in a hold, and again while it lands: tests/core/test_verdict.py."""
-    at_s = 6.2
+    at_s = 4.2
     result = FastFlight(short(), {at_s: OperatorCommand.LAND}).run()
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert not result.crashed

@@ -17,6 +17,8 @@ from tests.flights.ends import after
 from tests.flights.test_fast_flights import event_ids
 from tests.support import CATCH, SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
 UNTIL_S = 9.0
 """Mission time, 2.5 s after the expected catch."""
 

@@ -14,6 +14,8 @@ from sitl.world.handling import Wrench
 from sitl.world.machine import Machine
 from tests.support import HOVER, LOW_HOVER
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
 LIES_AT_RAD = math.radians(50.0)
 """Two feet 0.18 m beside the origin and 0.28 m below it, and the edge of a rotor disk 0.45 m beside it: atan(0.31 / 0.27) = 49 deg."""
 STIFFNESS_NM, DAMPING_NMS = 80.0, 8.0
@@ -47,7 +49,7 @@ class TippedOver(FastFlight):
 
 
 @pytest.mark.parametrize(
-    ("below_m", "after_s"), [(0.35, 8.7), (0.31, 10.2)], ids=["just before touch-down", "after touch-down"]
+    ("below_m", "after_s"), [(0.35, 6.7), (0.31, 8.2)], ids=["just before touch-down", "after touch-down"]
 )
 def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_flight(below_m: float, after_s: float) -> None:
     flight = TippedOver(below_m, after_s)
@@ -60,7 +62,7 @@ def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_flight(below_m: 
 
 
 def test_tipped_over_on_the_floor_its_rotors_are_stopped_by_the_guardian() -> None:
-    flight = TippedOver(0.35, 8.7, "{kind: kill_flight, t_s: 4.4}")
+    flight = TippedOver(0.35, 6.7, "{kind: kill_flight, t_s: 4.4}")
     result = flight.run()
     assert result.guardian_landed is True
     assert "tipped over on the floor: FORCE_DISARM is requested at once" in [e.text for e in result.guardian_events]
