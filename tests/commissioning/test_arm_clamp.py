@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -12,8 +12,11 @@ from companion.model.exit_codes import EXIT_OK
 from sitl.servo.bus import ServoBus
 from sitl.servo.model import ServoModel
 from tests.commissioning.arm_rig import Rig, bad_ids, keys, row_of, served
+from tests.commissioning.test_arm_faults import searched
 from tests.io.arm_rig import register
 from tests.support import ROOT, sandbox_in
+
+__all__ = ["searched"]
 
 FILE = ROOT / "configs/vehicles/tarot650_2r_clamp.yaml"
 
@@ -29,7 +32,8 @@ def settings(clamp: ServoModel) -> tuple[int, int, int, int]:
     return clamp.servo_id, clamp.baud_bps, register(clamp, 11), register(clamp, 9)
 
 
-def test_a_servo_with_another_id_becomes_the_clamps(tmp_path: Path) -> None:
+def test_a_servo_with_another_id_becomes_the_clamps(tmp_path: Path, searched: Callable[..., None]) -> None:
+    searched(57_600)
     clamp = ServoModel(7, baud_bps=57_600, kind="XL330-M288")
     joints = [ServoModel(joint.servo_id, kind=joint.kind.name) for joint in load_vehicle(FILE).arm.joints]
     with bench(tmp_path, *joints, clamp) as one:
@@ -44,7 +48,10 @@ def test_a_servo_with_another_id_becomes_the_clamps(tmp_path: Path) -> None:
         assert code == EXIT_OK and row_of(found, "arm.scan.joint3.operating_mode")["ok"]
 
 
-def test_a_servo_out_of_the_box_is_set_up_alone_and_its_id_is_that_of_a_joint(tmp_path: Path) -> None:
+def test_a_servo_out_of_the_box_is_set_up_alone_and_its_id_is_that_of_a_joint(
+    tmp_path: Path, searched: Callable[..., None]
+) -> None:
+    searched(57_600)
     clamp = ServoModel(1, baud_bps=57_600, kind="XL330-M288")
     with bench(tmp_path, clamp) as one:
         _, found = one.json("scan")
