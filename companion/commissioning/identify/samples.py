@@ -41,7 +41,8 @@ def read_part(path: Path) -> tuple[FlightLog, range | None]:
         return log, None
     caught = catch_index(log)
     flown = next((i.tick for i, o, _ in log.rows() if o.phase_kind is not PhaseKind.GROUND), log.inputs[0].tick)
-    begin = flown if caught is None else max(flown, log.inputs[caught].tick - TICKS_KEPT // 2)
+    around = flown if caught is None else log.inputs[caught].tick - TICKS_KEPT // 2
+    begin = max(flown, min(around, log.inputs[-1].tick + 1 - TICKS_KEPT))
     del log  # its memory is needed
     part = range(begin, begin + TICKS_KEPT)
     return FlightLog.read(path, part=part), part
