@@ -122,12 +122,18 @@ class FastGuardian:
             LinkIdentity(autopilot_system=system, own_system=_OWN[0], own_component=_OWN[1], local_port=0), origin_s=0.0
         )
         self._round_s = 0.0
+        self._pose_filter = PoseFilter(limits_of(vehicle.safety))
         self.events: list[Event] = []
         self.alive = True
 
     def heartbeat(self, inputs: Inputs, outputs: Outputs) -> None:
         """Process the heartbeat of one control tick of the flight process."""
         self._beat = self._heartbeats.of(inputs, outputs)
+
+    def see(self, pose: MocapPose) -> None:
+        """Learn the motion-capture server's clock from a pose that arrives in standby."""
+        if self.alive:
+            self._pose_filter.latency_s(pose)
 
     def decides_to_take_over(self, t_s: float, heard: bool, dead: bool) -> bool:
         """Return whether the guardian now takes over from the flight process, and record the event; call this method in every tick.
@@ -154,13 +160,15 @@ class FastGuardian:
     def take_over(self, t_s: float) -> Landing:
         """Take control of the vehicle and return the landing."""
         assert self._beat is not None
-        return Landing(self._beat, self._vehicle, self._px4, t_s, self.events.append)
+        return Landing(self._beat, self._vehicle, self._px4, self._pose_filter, t_s, self.events.append)
 
 
 class Landing:
     """A landing that the guardian controls."""
 
-    def __init__(self, beat: Heartbeat, vehicle: Vehicle, px4: Px4Stub, t_s: float, notify: Notify) -> None:
+    def __init__(
+        self, beat: Heartbeat, vehicle: Vehicle, px4: Px4Stub, pose_filter: PoseFilter, t_s: float, notify: Notify
+    ) -> None:
         self._wire = MemoryWire(px4)
         self._link = Link(self._wire, _OWN, beat.autopilot_system)
         clearance_m, tilt_max_rad = vehicle.airframe.ground_clearance_m, math.radians(vehicle.safety.tilt_abort_deg)
@@ -168,7 +176,7 @@ class Landing:
             beat,
             clearance_m,
             tilt_max_rad,
-            PoseFilter(limits_of(vehicle.safety)),
+            pose_filter,
             self._link,
             t_s,
             notify,

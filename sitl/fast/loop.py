@@ -235,7 +235,10 @@ class FastFlight:
         if plant.faults is not None:
             self._bus.step(plant.scene.t_s)
         for frame in plant.mocap.take()[-1:]:  # of frames that wait, the driver delivers the newest
-            self._forward(self._mocap.receive(frame, plant.scene.t_s))
+            pose = self._mocap.receive(frame, plant.scene.t_s)
+            self._forward(pose)
+            if self._guardian is not None and not self._external:
+                self._guardian.see(pose)
         if self._force_period_s is not None and plant.scene.t_s >= self._force_due_s - TIME_EPSILON_S:
             self._force_due_s += self._force_period_s
             self._sample_force()

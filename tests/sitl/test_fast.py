@@ -10,9 +10,11 @@ import pytest
 from msgspec.structs import replace
 
 from companion.control.types import PlantState, Wrench
+from companion.model.outputs import Outputs
 from companion.model.servos import WATCHDOG_ERROR
-from companion.model.types import Joints, Outcome, PhaseKind, Reference, SafetyAction, Severity
+from companion.model.types import Inputs, Joints, MocapPose, Outcome, PhaseKind, Reference, SafetyAction, Severity
 from companion.sitl_config.loader import SitlConfig, load_sitl
+from sitl.fast.guardian import FastGuardian
 from sitl.fast.loop import FastFlight
 from sitl.faults.timing import ARMED_SEEN_S
 from tests.support import LOW_HOVER, ROOT
@@ -146,3 +148,39 @@ def test_the_garbage_collector_is_left_as_it_was(on: bool) -> None:
         assert gc.isenabled() is on
     finally:
         (gc.enable if was_on else gc.disable)()
+
+
+def test_the_guardian_learns_the_servers_clock_in_standby() -> None:
+    """Poses that are late from the takeover on are refused, as by the guardian of a flight, also without the server's echoes."""
+    sent: list[float] = []
+    for standby_s in (0.0, 1.0):
+        flight = FastFlight(configured())
+        guardian = FastGuardian(flight.config.flight.vehicle, flight.px4)
+        guardian.heartbeat(*_first_tick(flight))
+        for k in range(round(standby_s / 0.01)):
+            guardian.see(_pose(0.01 * k, delay_s=0.0))
+        landing = guardian.take_over(2.0)
+        before = flight.px4.vision_received
+        for k in range(10):
+            landing.step(2.0 + 0.01 * k, [_pose(2.0 + 0.01 * k, delay_s=0.3)])
+        sent.append(flight.px4.vision_received - before)
+    assert sent == [10, 0]
+
+
+def _first_tick(flight: FastFlight) -> tuple[Inputs, Outputs]:
+    result = flight.run(0.1)
+    return result.inputs[0], result.outputs[0]
+
+
+def _pose(t_s: float, *, delay_s: float) -> MocapPose:
+    """A pose without a latency that ends at its arrival, from a server whose clock is 5000 s ahead."""
+    return MocapPose(
+        stamp_s=t_s,
+        latency_s=0.0,
+        frame_number=round(100.0 * t_s),
+        position_world_m=(0.0, 0.0, 1.0 + 1e-4 * t_s),
+        attitude_wxyz=(1.0, 0.0, 0.0, 0.0),
+        tracking_valid=True,
+        marker_error_m=0.0,
+        exposure_server_s=5000.0 + t_s - delay_s,
+    )
