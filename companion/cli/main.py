@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import errno
 import importlib
 import re
@@ -58,11 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return _run(_normalised(words))
     except KeyboardInterrupt:  # also while modules are imported, which takes most of the time of a short command
-        from companion.model.exit_codes import EXIT_ABORTED
+        from companion.runtime.interrupt import interrupted
 
-        with contextlib.suppress(OSError):
-            sys.stderr.write(f"{' '.join(['companion', *words[:1]])}: interrupted\n")
-        return EXIT_ABORTED
+        return interrupted(words)
 
 
 def _run(words: list[str]) -> int:

@@ -370,3 +370,24 @@ def test_an_interrupt_while_modules_are_imported_is_one_line(
 
     monkeypatch.setattr("companion.cli.main.importlib.import_module", interrupted)
     assert companion("replay", "flight.mcap") == Ended(EXIT_ABORTED, "", "companion replay: interrupted\n")
+
+
+_INTERRUPTED_IMPORT = """
+import sys
+
+class Interrupted:
+    def find_spec(self, name, *_):
+        if name == "companion.cli.main":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Interrupted())
+"""
+
+
+def test_an_interrupt_while_the_command_itself_is_imported_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(_INTERRUPTED_IMPORT, encoding="utf-8")
+    ended = subprocess.run(
+        [sys.executable, "-m", "companion", "--help"],
+        capture_output=True, text=True, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )  # fmt: skip
+    assert (ended.returncode, ended.stdout, ended.stderr) == (EXIT_ABORTED, "", "companion --help: interrupted\n")
