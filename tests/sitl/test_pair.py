@@ -26,6 +26,7 @@ Commands = Sequence[Mapping[float, OperatorCommand]]
 def _short(short_start: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """A flight with faults that is ended in the air is not followed to the floor."""
     monkeypatch.setattr("sitl.fast.loop.SETTLE_S", 0.0)
+    monkeypatch.setattr("companion.phases.carry.grip.SETTLE_S", 0.5)
 
 
 def team_of(*overrides: str, commands: Commands = ({}, {})) -> FastTeam:
@@ -65,7 +66,7 @@ def assert_both_have_let_go(team: FastTeam, result: TeamResult, height_m: float)
 def held() -> tuple[FastTeam, TeamResult]:
     """A flight of both with a hold of each on the way: the right one holds because the left one does, and then by its own command."""
     hold, resume = OperatorCommand.HOLD, OperatorCommand.RESUME
-    return flown(commands=({12.7: hold, 13.3: resume}, {13.0: hold, 13.8: resume}))
+    return flown(commands=({11.5: hold, 12.1: resume}, {11.8: hold, 12.6: resume}))
 
 
 def times(member: FastResult, grip: Grip) -> list[float]:
@@ -99,7 +100,7 @@ def test_a_hold_of_both_ends_at_one_instant_once_each_that_was_commanded_is_resu
     assert "partner_holds" in ids(result.members[1])
     went_on = [[e.t_s for o in member.outputs for e in o.events if e.id == "goes_on"] for member in result.members]
     assert [len(instants) for instants in went_on] == [1, 1]
-    assert went_on[0][0] > 13.8
+    assert went_on[0][0] > 12.6
     assert abs(went_on[0][0] - went_on[1][0]) <= 0.0051
     left, right = (times(member, Grip.STANDING) for member in result.members)
     assert abs(left[0] - right[0]) <= 0.0051, "both have continued at one place of their plans"
@@ -107,7 +108,7 @@ def test_a_hold_of_both_ends_at_one_instant_once_each_that_was_commanded_is_resu
 
 def test_members_that_are_far_apart_in_their_plans_do_not_continue_but_set_the_bar_down_when_the_hold_expires() -> None:
     """What the left one announces is 5 s ahead: followed, the right one would leave its end of the bar."""
-    commands: Commands = ({12.0: OperatorCommand.HOLD, 12.3: OperatorCommand.RESUME}, {})
+    commands: Commands = ({10.8: OperatorCommand.HOLD, 11.1: OperatorCommand.RESUME}, {})
     team = team_of("vehicle.safety.hold_max_s=0.7", commands=commands)
     left = team.flights[0]
     announced = left.announced
@@ -119,7 +120,7 @@ def test_members_that_are_far_apart_in_their_plans_do_not_continue_but_set_the_b
         return replace(said, together=replace(said.together, plan_s=said.together.plan_s + 5.0))
 
     left.announced = ahead  # type: ignore[method-assign]
-    result = team.run(15.8)
+    result = team.run(14.6)
     for member in result.members:
         assert "goes_on" not in ids(member)
     assert "hold_expired" in ids(result.members[0])
@@ -190,7 +191,7 @@ def test_a_member_whose_process_is_killed_brings_both_down() -> None:
 
 
 def test_a_member_that_px4_lands_blindly_is_not_waited_for_and_does_not_descend_into_its_handle() -> None:
-    team, result = flown("right.world.faults=[{kind: mocap_occluded, t_s: 10.5}]")
+    team, result = flown("right.world.faults=[{kind: mocap_occluded, t_s: 9.3}]")
     left, right = result.members
     assert {"mocap_invalid", "bar_let_go"} <= set(ids(right))
     (holds_s, lands_s) = (
@@ -202,7 +203,7 @@ def test_a_member_that_px4_lands_blindly_is_not_waited_for_and_does_not_descend_
 
 
 def test_a_clamp_whose_servo_shuts_down_in_the_air_lands_both_and_the_bar_is_set_down() -> None:
-    team, result = flown("left.world.faults=[{kind: clamp_overload, t_s: 12.5}]")
+    team, result = flown("left.world.faults=[{kind: clamp_overload, t_s: 11.3}]")
     left, right = result.members
     assert ids(left)[2] == "clamp_error"
     assert ids(right)[2:4] == ["partner_holds", "partner_lands"]
@@ -223,8 +224,8 @@ def test_a_bar_too_far_from_its_place_is_not_gripped_and_both_land_beside_it() -
 
 def test_a_bar_that_tilts_stops_both() -> None:
     """The right one's battery sags until its rotors carry it no more: before one of the two notices anything else, both hold."""
-    sags = "right.world.faults=[{kind: battery_sag, t_s: 10.5, duration_s: 3.0, size: 4.0}]"
-    team, result = flown(sags, limit_s=14.5)
+    sags = "right.world.faults=[{kind: battery_sag, t_s: 9.3, duration_s: 3.0, size: 4.0}]"
+    team, result = flown(sags, limit_s=13.3)
     for member in result.members:
         assert ids(member)[2] == "bar_tilted"
     assert_both_have_let_go(team, result, 0.1)
@@ -233,8 +234,8 @@ def test_a_bar_that_tilts_stops_both() -> None:
 def test_a_link_that_gets_later_and_later_lands_both() -> None:
     """They keep arriving: only the clock that both share shows how old they are. A silent link: tests/safety/test_rules.py."""
     config = load_team("carry", SHORT_CARRY, world="ideal")
-    team = FastTeam(config, link_delay_s=lambda t_s: 0.002 if t_s <= 12.0 else 0.5 * (t_s - 12.0))
-    result = team.run(15.8)
+    team = FastTeam(config, link_delay_s=lambda t_s: 0.002 if t_s <= 10.8 else 0.5 * (t_s - 10.8))
+    result = team.run(14.6)
     for member in result.members:
         assert ids(member)[2] == "partner_late"
     assert_both_have_let_go(team, result, 0.1)
