@@ -22,6 +22,8 @@ from sitl.fast.result import FastResult
 from tests.control.states import POSE, ZERO, at, at_rest
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
 MISSION = "configs/missions/catch.yaml"
 WEIGHT_N = 3.0 * 9.81
 

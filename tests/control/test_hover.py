@@ -20,6 +20,9 @@ from tests.control.states import at
 from tests.flights.ends import flown_until
 from tests.support import CATCH, SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
+
 MASS_KG = 3.0
 START, TRUE = 0.5, 0.45
 DT_S = 0.005

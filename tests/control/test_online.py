@@ -25,6 +25,9 @@ from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
+
 CONFIG = load_flight("configs/missions/circuit.yaml", preset="recommended")
 assert isinstance(CONFIG.controller, AdaptiveConfig)
 LAW = AdaptiveConfig.model_validate(CONFIG.controller.model_dump() | {"online": {"bound": 1.4}})

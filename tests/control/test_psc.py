@@ -24,6 +24,9 @@ from tests.analysis.recorded import record
 from tests.control.states import POSE, at, at_rest
 from tests.flights.test_fast_flights import error_after_catch_m, event_ids
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
+
 MISSION = "configs/missions/catch.yaml"
 MASS_KG, G = 3.0, 9.81
 

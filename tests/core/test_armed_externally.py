@@ -33,6 +33,8 @@ from tests.flights.ends import Changed
 from tests.safety.healthy import healthy, put
 from tests.support import CATCH, SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
 replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
 
@@ -108,10 +110,10 @@ def test_whatever_else_is_wrong_it_lands(mode: FlightMode, command: OperatorComm
 def test_armed_by_somebody_else_while_the_companion_waits_it_does_not_take_off() -> None:
     """On the ground, in the mode that the companion itself has asked for."""
     flight = FastFlight(load_sitl(CATCH))
-    inputs = flight.run(limit_s=2.1).inputs
+    inputs = flight.run(limit_s=1.2).inputs
     core, outputs = FlightCore(flight.config), []
     for i in inputs:
-        if i.t_s > 1.5:
+        if i.t_s > 0.6:
             i = put("status", armed=True, mode=FlightMode.OFFBOARD)(i)
         outputs.append(core.step(i))
     assert outputs[-1].request is AutopilotRequest.DISARM
@@ -174,7 +176,7 @@ def flown(
 
 
 @pytest.mark.parametrize(
-    ("mission", "died_s", "gone_s"), [(CATCH, 7.2, 8.0), (SHORT_CATCH, 7.8, 0.1), (SHORT_CATCH, 7.8, 2.5)]
+    ("mission", "died_s", "gone_s"), [(CATCH, 5.2, 8.0), (SHORT_CATCH, 5.8, 0.1), (SHORT_CATCH, 5.8, 2.5)]
 )
 def test_started_again_in_the_air_it_lands_what_still_flies(mission: Path, died_s: float, gone_s: float) -> None:
     """PX4 has been without motion capture and has no barometer: after 4.5 s it descends blindly and never finds that it stands."""
@@ -205,19 +207,19 @@ def assert_folds_at_a_bounded_rate(result: FastResult, since_s: float) -> None:
 
 def test_with_a_dead_arm_bus_it_lands_all_the_same() -> None:
     """The servos' currents end with the process that wrote them: the arm hangs."""
-    flight, result = flown(7.8, 10.3, lambda i: replace(i, arm=None, force=None) if i.t_s >= 7.8 else i)
+    flight, result = flown(5.8, 8.3, lambda i: replace(i, arm=None, force=None) if i.t_s >= 5.8 else i)
     assert result.outputs[-1].outcome is Outcome.ABORTED
     assert not result.crashed and not flight.px4.armed
-    assert all(o.arm_torque_nm is None for o in result.outputs if o.t_s >= 7.8)
+    assert all(o.arm_torque_nm is None for o in result.outputs if o.t_s >= 5.8)
     assert max(abs(angle) for truth in result.truth for angle in truth.joint_angle_rad) < math.radians(180)
 
 
 def test_a_pilot_who_flies_is_only_given_motion_capture() -> None:
     def change(i: Inputs) -> Inputs:
-        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 7.8 else i
+        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 5.8 else i
 
-    _, result = flown(7.8, 8.0, change)
-    after = [o for o in result.outputs if o.t_s >= 8.0]
+    _, result = flown(5.8, 6.0, change)
+    after = [o for o in result.outputs if o.t_s >= 6.0]
     assert all(o.attitude is None and o.request is AutopilotRequest.NONE for o in after)
     assert ids(after).count("armed_externally") == 1
     assert after[-1].outcome is Outcome.ABORTED, "PX4 disarmed"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import msgspec
+import pytest
 
 from companion.model.types import (
     AutopilotRequest,
@@ -25,6 +26,8 @@ from tests.flights.ends import Changed
 from tests.safety.healthy import put
 from tests.support import HOVER, SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
 replace = msgspec.structs.replace
 Change = Callable[[Inputs], Inputs]
 STANDS_M = load_sitl("configs/missions/catch.yaml").vehicle.airframe.ground_clearance_m
@@ -42,7 +45,7 @@ class Spoiled(Changed):
 
         def lifted() -> list[MocapFrame]:
             """The error comes in slowly, as a shifting volume would bring it; PX4 is reported the same."""
-            by_m = lift_m * min(1.0, max(0.0, (plant.t_s - 4.0) / 8.0))
+            by_m = lift_m * min(1.0, max(0.0, (plant.t_s - 2.0) / 8.0))
             frames = [(frame, *frame.position_world_m) for frame in take()]
             return [frame._replace(position_world_m=(x, y, z + by_m)) for frame, x, y, z in frames]
 
@@ -114,7 +117,7 @@ def test_a_land_detector_that_never_fires_is_overruled_on_the_floor() -> None:
 
 def test_a_land_detector_that_always_fires_stops_no_rotor_in_the_air() -> None:
     def change(i: Inputs) -> Inputs:
-        return put("status", landed=LandedState.ON_GROUND)(i) if i.t_s > 5.0 else i
+        return put("status", landed=LandedState.ON_GROUND)(i) if i.t_s > 3.0 else i
 
     flight, result = flown(change)
     assert_landed(flight, result, Outcome.COMPLETED)
@@ -124,7 +127,7 @@ def test_a_land_detector_that_always_fires_stops_no_rotor_in_the_air() -> None:
 def test_in_px4s_own_landing_its_detector_may_be_deaf() -> None:
     """Motion capture lags behind what PX4 says of itself: the ladder lets PX4 land, which never finds the floor."""
     flight, result = flown(
-        lambda i: put("vehicle", attitude_wxyz=(0.8, 0.6, 0.0, 0.0))(i) if 6.5 < i.t_s < 6.65 else i, deaf=True
+        lambda i: put("vehicle", attitude_wxyz=(0.8, 0.6, 0.0, 0.0))(i) if 4.5 < i.t_s < 4.65 else i, deaf=True
     )
     assert "tilt" in ids(result)
     assert_landed(flight, result, Outcome.ABORTED)
@@ -136,7 +139,7 @@ def test_estimate_frozen_just_above_the_floor_is_no_touchdown() -> None:
 
     def change(i: Inputs) -> Inputs:
         vehicle = i.vehicle
-        if vehicle is None or vehicle.position_world_m[2] > STANDS_M + 0.11 or i.t_s < 7.0:
+        if vehicle is None or vehicle.position_world_m[2] > STANDS_M + 0.11 or i.t_s < 5.0:
             return i
         held: Vec3 = (*vehicle.position_world_m[:2], STANDS_M + 0.1)
         return replace(i, vehicle=replace(vehicle, position_world_m=held, velocity_world_m_s=(0.0, 0.0, 0.001)))

@@ -24,6 +24,8 @@ from sitl.fast.loop import FastFlight
 from tests.flights.ends import flown_until
 from tests.support import SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
 
 def plain(value: object) -> object:
     """A copy of a record as dictionaries, down to its last value; plans left out, because each is another object."""

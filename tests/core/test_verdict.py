@@ -24,6 +24,8 @@ from tests.flights.test_ladder_flights import TAUT
 from tests.safety.healthy import put
 from tests.support import HOVER, LOW_HOVER
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
 HOLD, RESUME, LAND, ABORT, START = (
     OperatorCommand.HOLD,
     OperatorCommand.RESUME,
@@ -110,8 +112,8 @@ def off_its_way(since_s: float, until_s: float, x_m: float = 0.65) -> Change:
 
 
 def test_hold_resume_hold_resume_land() -> None:
-    first = ((7.0, HOLD), (8.0, HOLD), (9.0, RESUME), (9.5, RESUME), (9.8, HOLD), (10.3, RESUME))
-    flown = commanded(*first, (11.0, LAND), (11.5, LAND), (11.7, HOLD), (11.9, RESUME), (12.1, START), until_s=12.2)
+    first = ((5.0, HOLD), (6.0, HOLD), (7.0, RESUME), (7.5, RESUME), (7.8, HOLD), (8.3, RESUME))
+    flown = commanded(*first, (9.0, LAND), (9.5, LAND), (9.7, HOLD), (9.9, RESUME), (10.1, START), until_s=10.2)
     assert flown.effects == [
         (True, "holding"),
         (True, "already holding"),
@@ -135,8 +137,8 @@ def test_hold_resume_hold_resume_land() -> None:
 
 def test_a_hold_that_nobody_may_end_yet() -> None:
     """Off its reference: held by the monitor; going on is refused until that has been gone for a second."""
-    script, change = ((7.5, RESUME), (8.0, RESUME), (8.7, RESUME)), off_its_way(7.0, 7.3, 0.7)
-    flown = commanded(*script, change=change, sets=FORGIVING, until_s=9.0)
+    script, change = ((5.5, RESUME), (6.0, RESUME), (6.7, RESUME)), off_its_way(5.0, 5.3, 0.7)
+    flown = commanded(*script, change=change, sets=FORGIVING, until_s=7.0)
     for accepted, text in flown.effects[:2]:
         assert not accepted
         assert text.startswith("resume refused: 0.")
@@ -145,16 +147,16 @@ def test_a_hold_that_nobody_may_end_yet() -> None:
     assert [id_ for id_ in flown.ids if id_ in ("tracking_hold", "resume_refused")] == [
         *("tracking_hold", "resume_refused", "resume_refused")
     ]
-    assert {flown.at(t_s).action for t_s in (7.52, 8.02)} == {SafetyAction.HOLD}
-    assert flown.at(8.72).action is SafetyAction.NOMINAL
+    assert {flown.at(t_s).action for t_s in (5.52, 6.02)} == {SafetyAction.HOLD}
+    assert flown.at(6.72).action is SafetyAction.NOMINAL
 
 
 def test_a_resume_while_a_cause_stands_that_came_during_the_hold_is_refused() -> None:
-    change = off_its_way(9.2, 99.0, 0.7)
-    flown = commanded((8.7, HOLD), (10.2, RESUME), change=change, sets=FORGIVING, until_s=10.8)
+    change = off_its_way(7.2, 99.0, 0.7)
+    flown = commanded((6.7, HOLD), (8.2, RESUME), change=change, sets=FORGIVING, until_s=8.8)
     assert flown.effects[0] == (True, "holding")
     assert flown.effects[1][1].startswith("resume refused: ")
-    assert flown.at(10.7).action is SafetyAction.HOLD
+    assert flown.at(8.7).action is SafetyAction.HOLD
 
 
 # A jump of pose and estimate together is no finding of the ones that watch for jumps; 0.8 m off would be a landing.
@@ -168,7 +170,7 @@ FORGIVING = (
 
 def test_commands_while_it_goes_back_along_the_tether() -> None:
     flown = commanded(
-        (9.2, HOLD), (9.3, RESUME), (9.5, LAND), sets=(*TAUT, "vehicle.safety.retract_max_s=20"), until_s=10.2
+        (7.2, HOLD), (7.3, RESUME), (7.5, LAND), sets=(*TAUT, "vehicle.safety.retract_max_s=20"), until_s=8.2
     )
     assert flown.effects[:2] == [
         (False, "hold refused: the vehicle is returning along the tether and will land"),
@@ -178,26 +180,26 @@ def test_commands_while_it_goes_back_along_the_tether() -> None:
 
 
 def test_too_low_to_hold() -> None:
-    flown = commanded((6.1, HOLD), until_s=6.7)
+    flown = commanded((4.1, HOLD), until_s=4.7)
     assert flown.effects == [(True, "too low to hold: landing")]
 
 
 def test_nothing_is_done_against_a_pilot() -> None:
     def change(i: Inputs) -> Inputs:
-        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 6.0 else i
+        return put("status", mode=FlightMode.MANUAL)(i) if i.t_s >= 4.0 else i
 
-    flown = commanded((6.2, HOLD), (6.3, RESUME), (6.4, LAND), (6.5, ABORT), (6.6, START), change=change, until_s=6.7)
+    flown = commanded((4.2, HOLD), (4.3, RESUME), (4.4, LAND), (4.5, ABORT), (4.6, START), change=change, until_s=4.7)
     assert flown.effects == [
         (False, f"{name} refused: a pilot has control; nothing is sent")
         for name in ("hold", "resume", "land", "abort", "start")
     ]
-    assert flown.at(6.2).phase == "a pilot flies"
-    assert all(o.attitude is None for o in flown.outputs if o.t_s > 6.1)
+    assert flown.at(4.2).phase == "a pilot flies"
+    assert all(o.attitude is None for o in flown.outputs if o.t_s > 4.1)
 
 
 def test_commands_while_px4_lands_on_its_own() -> None:
     blind = ("world.faults=[{kind: mocap_loss, t_s: 3.7}]",)
-    flown = commanded((7.2, LAND), (7.3, ABORT), (7.4, HOLD), (7.5, RESUME), (7.6, START), sets=blind, until_s=7.8)
+    flown = commanded((5.2, LAND), (5.3, ABORT), (5.4, HOLD), (5.5, RESUME), (5.6, START), sets=blind, until_s=5.8)
     assert flown.effects[:2] == [(True, "recorded; PX4's own landing continues")] * 2
     assert [accepted for accepted, _ in flown.effects[2:]] == [False, False, False]
     assert all("PX4 is landing on its own" in text for _, text in flown.effects[2:])
@@ -268,7 +270,7 @@ def test_a_flight_that_takes_off_by_itself_needs_no_start() -> None:
 
 
 def test_it_waits_for_start_with_nothing_sent_and_then_flies() -> None:
-    lands_s = times_of(ordinary())["land"] + 1.0  # PX4's heartbeats come once a second
+    lands_s = times_of(ordinary())["land"] + 3.0  # PX4's heartbeats come once a second
     flown = commanded((2.0, HOLD), (3.0, START), (lands_s + 0.2, HOLD), (lands_s + 0.4, RESUME), sets=(*WAITS, *LOW))
     assert flown.effects == [
         (True, "the vehicle stays on the ground until start is commanded"),
@@ -321,7 +323,7 @@ def test_an_estimate_that_wanders_off_while_it_waits_is_reported() -> None:
 
 
 def test_a_start_that_comes_before_it_is_ready_is_refused_and_not_remembered() -> None:
-    flown = commanded((0.7, START), (3.0, START), (3.5, START), sets=WAITS, until_s=3.6)
+    flown = commanded((0.55, START), (3.0, START), (3.5, START), sets=WAITS, until_s=3.6)
     assert flown.effects[0][0] is False
     assert flown.effects[0][1].startswith("start refused: ")
     assert flown.at(2.9).phase == "waits for start"
@@ -338,7 +340,7 @@ def test_the_net_is_weighed_right_before_the_start() -> None:
         x, y, z = i.force.force_sensor_n
         return put("force", force_sensor_n=(x + drift_n, y, z))(i)
 
-    flown = commanded((4.5, START), change=change, sets=(*WAITS, *LOW), until_s=10.5)
+    flown = commanded((4.5, START), change=change, sets=(*WAITS, *LOW), until_s=9.8)
     felt = [o.control.force_ext_world_n for o in flown.outputs if o.control is not None and o.phase == "hold"]
     assert felt
     assert max(math.hypot(*force_n) for force_n in felt) < 0.6

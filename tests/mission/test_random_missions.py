@@ -7,6 +7,9 @@ from hypothesis import settings
 
 from tests.mission.random_missions import Row, fly
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
+
 COUNT = min(40, settings().max_examples // 9)
 PHASES_MAX = 2
 

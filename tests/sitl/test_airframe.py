@@ -21,6 +21,8 @@ from sitl.fast.loop import FastFlight
 from tests.sitl.plants import OneMachine
 from tests.support import HOVER, LOW_HOVER, SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
 VEHICLE = load_sitl(HOVER).vehicle
 
 

@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from companion.mission.check import check_mission
 from companion.sitl_config.loader import load_sitl
 from sitl.fast.loop import FastFlight
 
-CATCH_S = 12.7
+pytestmark = pytest.mark.usefixtures("short_start")
+
+CATCH_S = 10.7
 
 
 def test_an_arm_of_four_joints_from_a_urdf_catches_the_payload() -> None:
