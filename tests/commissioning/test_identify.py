@@ -86,8 +86,6 @@ def test_identify_writes_a_world_and_a_vehicle_file_that_load(
     log = record(flown[0], tmp_path / "flight.mcap")
     vehicle = Path(shutil.copy(ROOT / "configs/vehicles/tarot650_2r.yaml", tmp_path / "mine.yaml"))
     told = companion("identify", log, "--vehicle", vehicle).out
-    hover_thrust = identify(flown[0])["hover_thrust"].value
-    assert f"PX4: set MPC_THR_HOVER to {hover_thrust:.4f}; the vehicle file leaves the hover thrust to PX4" in told
     assert "hover_thrust:" not in told, "the file would no longer follow PX4"
     text = vehicle.read_text(encoding="utf-8").replace("airframe:", "airframe:\n  hover_thrust: 0.62")
     vehicle.write_text(text, encoding="utf-8")
@@ -95,6 +93,8 @@ def test_identify_writes_a_world_and_a_vehicle_file_that_load(
     printed = companion("identify", log, "--vehicle", vehicle, "--apply").out
     result = json.loads((tmp_path / RESULT).read_text(encoding="utf-8"))
     values = {one["key"]: one["value"] for one in result["quantities"]}
+    thrust = f"{values['hover_thrust']:.4f}"
+    assert f"PX4: set MPC_THR_HOVER to {thrust}; the vehicle file leaves the hover thrust to PX4" in told
     assert all(one["title"] in printed for one in result["quantities"])
     world, laboratory = load_world((f"world.seed={SEED}",), str(tmp_path / WORLD), 2, 4)
     assert world.payload_kg == pytest.approx(values["payload_kg"], rel=0.15)

@@ -11,12 +11,13 @@ import shutil
 import signal
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
 from companion.analysis.log import FlightLog
 from companion.model.exit_codes import EXIT_BAD_INPUT, EXIT_OK
-from tests.plugins.installed import write_distribution
+from tests.plugins.installed import on_path, write_distribution
 from tests.support import HOVER, ROOT, Ended, Sandbox, hooked, read_summary, run_here, sandbox_in, set_options
 
 
@@ -25,6 +26,8 @@ class Flown:
     """The one flight of this file, after it has ended."""
 
     sandbox: Sandbox
+    site: Path
+    """Where the law of another package is installed."""
     ended: Ended
     disarms: int
     """Requests to disarm that PX4 has received."""
@@ -58,7 +61,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flown]:
             running.close_output()
             ended = running.end()
         sandbox.assert_nobody_left()
-        yield Flown(sandbox, ended, int(disarms.read_text(encoding="utf-8")))
+        yield Flown(sandbox, site, ended, int(disarms.read_text(encoding="utf-8")))
 
 
 def test_a_guardian_that_dies_in_the_air_is_reported_and_the_flight_goes_on(flown: Flown) -> None:
@@ -99,7 +102,8 @@ def test_a_law_of_another_package_flies_it_and_the_log_is_replayed_where_it_is_i
     assert flown.ended.code == EXIT_OK, flown.ended
     flight = flown.log.metadata["flight"]
     assert (flight["law"], flight["law_distribution"], flight["law_version"]) == ("lqr", "lab-lqr", "0.1.0")
-    replayed = flown.sandbox.run("replay", "out/flight.mcap")
+    with on_path(flown.site):
+        replayed = run_here("replay", flown.sandbox.cwd / "out/flight.mcap")
     assert replayed.code == EXIT_OK, (replayed.out, replayed.err)
     without = run_here("replay", flown.sandbox.cwd / "out/flight.mcap")
     assert without.code == EXIT_BAD_INPUT

@@ -242,7 +242,7 @@ def test_the_log_of_a_flight_killed_by_9_is_closed_and_whole(tmp_path: Path) -> 
 
 def test_a_full_disk_is_said_once_and_the_log_so_far_is_kept(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     recorder = started(tmp_path)
-    resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (2**20, 2**20))  # some chunks
+    resource.prlimit(recorder.process.pid, resource.RLIMIT_FSIZE, (2**19, 2**19))  # some chunks
     offered = 0
     deadline_s = time.monotonic() + DEADLINE_S
     while recorder.client.error is None:
