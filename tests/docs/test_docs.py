@@ -152,10 +152,10 @@ def test_pictures_are_small() -> None:
 
 def test_commands_parse_and_their_overrides_are_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    seen, loaded = set(), set()
+    seen, loaded, parser = set(), set(), make_parser()
     for page, words in commands():
         seen.add(words[0])
-        arguments, unknown = make_parser().parse_known_args(_normalised(words))
+        arguments, unknown = parser.parse_known_args(_normalised(words))
         assert unknown == [], f"{page}: companion {shlex.join(words)}"
         mission = getattr(arguments, "mission", None)
         # MISSION stands for any; a vehicle file that the user is to write is not there.

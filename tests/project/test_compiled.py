@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -101,12 +102,18 @@ def test_the_list_of_modules_names_only_files_that_exist() -> None:
     assert Path("companion/config/files/controllers/psc_tuned.yaml") in sources(), "settings, which the wheel contains"
 
 
+@cache
+def nodes() -> list[tuple[str, ast.AST]]:
+    """Return the syntax of the compiled modules, each node with its file."""
+    trees = ((name, ast.parse((ROOT / name).read_text(encoding="utf-8"))) for name in modules())
+    return [(name, node) for name, tree in trees for node in ast.walk(tree)]
+
+
 def test_no_tuple_of_floats_is_final() -> None:
     """mypyc 2.4 compiles some reads of such a constant to a NameError: `if (value.f0 != -113.0 && PyErr_Occurred())` is inverted."""
     final = [
         f"{name}:{node.lineno}"
-        for name in modules()
-        for node in ast.walk(ast.parse((ROOT / name).read_text(encoding="utf-8")))
+        for name, node in nodes()
         if isinstance(node, ast.AnnAssign) and "Final" in ast.unparse(node.annotation)
         if isinstance(node.value, ast.Tuple) and any(is_float(element) for element in node.value.elts)
     ]
@@ -117,8 +124,7 @@ def test_no_sum_is_added_to_a_sum() -> None:
     """mypyc takes `sum(a) + sum(b)` of floats for an int: a TypeError in flight."""
     added = [
         f"{name}:{node.lineno}"
-        for name in modules()
-        for node in ast.walk(ast.parse((ROOT / name).read_text(encoding="utf-8")))
+        for name, node in nodes()
         if isinstance(node, ast.BinOp) and is_sum(node.left) and is_sum(node.right)
     ]
     assert added == []
