@@ -70,7 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     a = parser.parse_args(arguments)
     flights = [(name, a.world, seed) for name in LAWS for seed in range(a.first, a.first + a.laboratories)]
     with ProcessPoolExecutor(a.jobs) as pool:
-        flown = np.array(list(pool.map(errors, *zip(*flights, strict=True)))).reshape(len(LAWS), a.laboratories, 3)
+        rows_of = list(pool.map(errors, *zip(*flights, strict=True)))
+    flown = np.array(rows_of).reshape(len(LAWS), a.laboratories, 3)
     rows = []
     for (name, (*_, paper_mm, paper_deg)), found in zip(LAWS.items(), flown, strict=True):
         p5, p50, p95 = np.nanpercentile(found[:, 0], (5, 50, 95))

@@ -272,4 +272,5 @@ def _vertex(grid: Floats, costs: Floats, best: int) -> tuple[float, float]:
 def _moving_mean(t: Floats, values: Floats) -> Floats:
     first, last = np.searchsorted(t, t - _SLOW_S), np.searchsorted(t, t + _SLOW_S, side="right")
     total = np.vstack([np.zeros(values.shape[1]), np.cumsum(values, axis=0)])
-    return np.asarray((total[last] - total[first]) / (last - first)[:, None], dtype=np.float64)
+    mean: Floats = (total[last] - total[first]) / (last - first)[:, None]
+    return mean
