@@ -13,7 +13,10 @@ from pathlib import Path
 import pytest
 
 from tests.support import CATCH, HOVER, LOW_HOVER, ROOT, USUAL, set_options
-from tools.compiled import BUILD, INTERPRETED, is_current, modules, sources
+from tools import compiled
+from tools.compiled import BUILD, INTERPRETED, is_current, sources
+
+modules = cache(compiled.modules)
 
 FLIGHT = """
 import hashlib, sys
