@@ -290,32 +290,44 @@ def test_an_option_and_a_set_of_the_same_value_are_accepted() -> None:
     assert main(["check", "hover", "--plan-only", *same]) == EXIT_OK
 
 
+def assert_cannot_be_written(command: str, code: int, err: str) -> None:
+    assert code == EXIT_BAD_INPUT
+    name = command.partition(" ")[0]
+    assert err.splitlines() == [f"companion {name}: standard output cannot be written: No space left on device"]
+
+
 @pytest.mark.parametrize(
-    ("command", "unbuffered"),
+    ("command", "buffering"),
     [
-        ("schema mission", "1"),
-        ("export flight.mcap --format csv", "1"),
-        ("team check carry --sitl", "1"),
-        ("faults --list", "1"),
-        ("faults --list", ""),
-        ("fly --help", "1"),
-        ("fly --help", ""),
+        ("schema mission", 1),
+        ("export flight.mcap --format csv", 1),
+        ("team check carry --sitl", 1),
+        ("fly --help", 1),
+        ("fly --help", -1),
     ],
 )
-def test_output_that_cannot_be_written_is_one_line(command: str, unbuffered: str, tmp_path: Path) -> None:
+def test_output_that_cannot_be_written_is_one_line(
+    command: str, buffering: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With a buffer of a line, as PYTHONUNBUFFERED makes it, and with the usual one."""
+    monkeypatch.chdir(tmp_path)
     if command.startswith("export"):
         pytest.importorskip("pandas")
         record_flight(tmp_path / "flight.mcap", end_s=1.0)
+    with open("/dev/full", "w", buffering=buffering) as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        code = main(command.split())
+    assert_cannot_be_written(command, code, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("unbuffered", ["1", ""])
+def test_output_of_a_program_that_cannot_be_written_is_one_line(unbuffered: str, tmp_path: Path) -> None:
     with open("/dev/full", "w") as full:
         ended = subprocess.run(
-            [sys.executable, "-P", "-m", "companion", *command.split()],
+            [sys.executable, "-P", "-m", "companion", "faults", "--list"],
             stdout=full, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
         )  # fmt: skip
-    name = command.partition(" ")[0]
-    assert ended.returncode == EXIT_BAD_INPUT
-    assert ended.stderr.splitlines() == [
-        f"companion {name}: standard output cannot be written: No space left on device"
-    ]
+    assert_cannot_be_written("faults", ended.returncode, ended.stderr)
 
 
 def test_a_completed_flight_stays_completed_without_room_for_its_output(
