@@ -82,6 +82,17 @@ def sandbox(tmp_path: Path) -> Iterator[Sandbox]:
         yield sandbox
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are composed and not drawn, which takes most of the time of a report: for tests that judge something else."""
+    monkeypatch.setattr("matplotlib.backends.backend_agg.FigureCanvasAgg.print_png", _not_drawn)
+    monkeypatch.setattr("matplotlib.backends.backend_svg.FigureCanvasSVG.print_svg", _not_drawn)
+
+
+def _not_drawn(_: object, path: Path, **__: object) -> None:
+    path.write_bytes(b"drawn")
+
+
 @pytest.fixture(scope="module")
 def short_wait() -> Iterator[None]:
     """The wait of a flight before its take-off is short: nothing but noise happens meanwhile."""

@@ -150,6 +150,7 @@ def test_every_command_refuses_a_log_whose_configuration_is_invalid(
     assert "vehicle.airframe" in line
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     "without", [["vehicle"], ["vehicle.arm"], ["vehicle.airframe", "vehicle.room", "mission", "sources"]], ids=str
 )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from companion.analysis import plot_style, tables
+from companion.analysis import tables
 from companion.analysis.export import write_lerobot, write_tables
 from companion.analysis.hover_fit import fit_hover_thrust
 from companion.analysis.log import TICKS_KEPT, FlightLog
@@ -168,10 +168,8 @@ def test_the_commands_keep_a_part_of_a_long_log_in_memory(
     assert limits == [TICKS_KEPT]
 
 
-def test_the_report_of_a_long_flight_names_the_share_of_ticks_kept(
-    thin: FlightLog, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(plot_style, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
+@pytest.mark.usefixtures("undrawn")
+def test_the_report_of_a_long_flight_names_the_share_of_ticks_kept(thin: FlightLog, tmp_path: Path) -> None:
     summary = summarise(thin, outcome="completed", controller="adaptive", preset="recommended")
     assert f"one in {thin.stride} (long flight)" in write_report(thin, summary, tmp_path).read_text()
 

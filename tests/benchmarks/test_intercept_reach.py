@@ -131,6 +131,7 @@ def test_a_ball_is_within_the_bounds_by_its_distance_and_its_time(
     assert row["left_s"] == pytest.approx(flies_s, abs=0.2)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_command_writes_each_throw_with_its_flight_and_both_pictures(tmp_path: Path) -> None:
     assert main(["--draws", "1", "--scatter", "1", "--out", str(tmp_path)]) == 0
     ((row,),) = json.loads((tmp_path / "intercept_reach.json").read_text()).values()

@@ -12,6 +12,7 @@ from tests.short_carry import SHORT_CARRY
 from tests.support import run_here
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_team_is_flown_in_drawn_laboratories_and_its_rows_carry_the_figures_of_the_bar(tmp_path: Path) -> None:
     ended = run_here(
         *("robustness", "carry", "--draws", "1", "--seed", "3", "--jobs", "1"),

@@ -89,8 +89,8 @@ def test_files_of_a_comparison_hold_what_is_printed(monkeypatch: pytest.MonkeyPa
     assert EVIL in page.text and "script" not in page.tags
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_terminal_shows_tables_and_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.analysis.plot_style.write_png", lambda figure, path: path.write_bytes(b"drawn"))
     fly_made_up(monkeypatch, lambda flight: compare_row(flight, None))
     ended = run_here(*COMPARE, "--seeds", "1")
     line = next(line for line in ended.out.splitlines() if "adaptive/paper" in line)
@@ -209,6 +209,7 @@ def test_the_controller_file_of_a_mission_is_named_where_its_flights_are_to_be_f
     assert run_here("robustness", "--cases", "out/worst.yaml", "--plan").code == EXIT_OK
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_file_of_cases_loses_none_that_was_not_flown(monkeypatch: pytest.MonkeyPatch) -> None:
     results = {"draw 0": 0.02, "draw 1": 0.03, "draw_0": 0.01, "draw_1": None}
 

@@ -89,10 +89,9 @@ def test_the_start_is_what_flies_and_a_found_file_flies_unchanged_on_its_vehicle
     )
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_campaigns_fly_a_file_of_gains(monkeypatch: pytest.MonkeyPatch) -> None:
     file = str(ROOT / "configs/controllers/csc_tuned.yaml")
-    monkeypatch.setattr("companion.campaigns.compare.plots.write_pictures", lambda *_: [])
-    monkeypatch.setattr("companion.campaigns.robustness.plots.write_distribution", lambda *_: False)
     fly_made_up(monkeypatch, compare_row)
     words = ("--mission", str(CATCH), "--payloads", "0.2", "--seeds", "1", "--presets", "tuned")
     ended = run_here("compare", *words, "--controllers", f"{file},psc,{file}", "--out", "out", "--json")

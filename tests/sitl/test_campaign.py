@@ -281,9 +281,9 @@ def test_ctrl_c_ends_the_workers_and_shows_what_is_there(place: Sandbox) -> None
     assert (place.cwd / "part/compare.html").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_draw_is_flown_again_as_a_case(place: Sandbox, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place.cwd)
-    monkeypatch.setattr("companion.campaigns.robustness.plots.write_distribution", lambda *_: False)
     options = ("--jobs", "1", "--json")
     machine = ("--vehicle", "hexa_2r", "--set", "vehicle.safety.arm_timeout_s=0.4", "--model-error", "0.1")
     ended = run_here("robustness", SHORT_CATCH, *machine, "--draws", "1", *options, "--out", "draws")

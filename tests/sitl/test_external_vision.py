@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from companion.analysis import plot_style
 from companion.analysis.report import write_report
 from companion.analysis.summary import summarise
 from companion.model.frames import quat_from_euler_zyx
@@ -71,10 +70,8 @@ def test_a_catch_completes_on_px4s_estimate_alone() -> None:
     assert not [event for event in events_of(result) if event.action.rank >= SafetyAction.WARN.rank]
 
 
-def test_the_other_programs_end_is_found_px4_lands_and_the_flight_has_its_report(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(plot_style, "write_png", lambda figure, path: path.write_bytes(b"drawn"))
+@pytest.mark.usefixtures("undrawn")
+def test_the_other_programs_end_is_found_px4_lands_and_the_flight_has_its_report(tmp_path: Path) -> None:
     flight, result = fly(HOVER, {"kind": "mocap_loss", "t_s": HOVERS_S})
     begun_s = flight.faults.begun_s
     assert begun_s is not None
