@@ -1,9 +1,10 @@
-"""Campaigns whose flights are made up: everything is real but the flying."""
+"""Campaigns without a process of their own, whose flights are made up or flown here."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,15 @@ import pytest
 
 from companion.campaigns.process import CampaignError, Message
 from companion.campaigns.runner import Campaign, Row
+from companion.sitl_config.loader import SitlConfig
+from sitl.campaigns.__main__ import _CAMPAIGNS
+from sitl.campaigns.runner import fly_all
 
 
 class Flights:
-    """The results of made-up flights, and an error after them."""
+    """The results of flights that no other process flies, and an error after them."""
 
-    def __init__(self, messages: list[Message], error: CampaignError | None) -> None:
+    def __init__(self, messages: Iterable[Message], error: CampaignError | None = None) -> None:
         self._messages, self._error = messages, error
 
     def results(self) -> Iterator[Message]:
@@ -40,6 +44,19 @@ def fly_made_up(
             if row is not None
         ]
         return contextlib.nullcontext(Flights(messages[::-1], error))
+
+    monkeypatch.setattr(Campaign, "start", start)
+
+
+def fly_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the flights of a campaign be flown in this process: the start of its own takes longer than a flight."""
+
+    def start(campaign: Campaign, out: Path) -> contextlib.AbstractContextManager[Flights]:
+        job = json.loads(json.dumps(campaign.job()))
+        prepare, fly = _CAMPAIGNS[job["campaign"]]
+        configs = [SitlConfig.model_validate_json(json.dumps(config)) for config in job["configs"]]
+        flown = fly_all(fly, configs, prepare(job, configs), 1, None)
+        return contextlib.nullcontext(Flights(json.loads(json.dumps(each, allow_nan=False)) for each in flown))
 
     monkeypatch.setattr(Campaign, "start", start)
 

@@ -8,12 +8,16 @@ from pathlib import Path
 
 import pytest
 
+from tests.campaigns.made_up import fly_here
 from tests.short_carry import SHORT_CARRY
 from tests.support import run_here
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_team_is_flown_in_drawn_laboratories_and_its_rows_carry_the_figures_of_the_bar(tmp_path: Path) -> None:
+def test_a_team_is_flown_in_drawn_laboratories_and_its_rows_carry_the_figures_of_the_bar(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fly_here(monkeypatch)
     ended = run_here(
         *("robustness", "carry", "--draws", "1", "--seed", "3", "--jobs", "1"),
         *(word for override in SHORT_CARRY for word in ("--set", override)),

@@ -34,6 +34,7 @@ from sitl.campaigns.flights import Flown
 from sitl.campaigns.runner import Fly
 from sitl.fast.loop import FastFlight
 from sitl.fast.result import FastResult
+from tests.campaigns.made_up import fly_here
 from tests.machines import overrides_with_joints
 from tests.support import DEADLINE_S, SHORT_CATCH, Sandbox, position_error_m, run_here, sandbox_in, wait_until
 
@@ -284,7 +285,8 @@ def test_ctrl_c_ends_the_workers_and_shows_what_is_there(place: Sandbox) -> None
 @pytest.mark.usefixtures("undrawn")
 def test_a_draw_is_flown_again_as_a_case(place: Sandbox, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place.cwd)
-    options = ("--jobs", "1", "--json")
+    fly_here(monkeypatch)
+    options = ("--json",)
     machine = ("--vehicle", "hexa_2r", "--set", "vehicle.safety.arm_timeout_s=0.4", "--model-error", "0.1")
     ended = run_here("robustness", SHORT_CATCH, *machine, "--draws", "1", *options, "--out", "draws")
     assert ended.code == EXIT_OK, ended.err
