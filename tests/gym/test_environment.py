@@ -58,7 +58,7 @@ def test_without_an_action_the_base_law_flies_and_the_rewards_are_its_cost() -> 
 
 
 def test_a_random_wrench_meets_the_supervisor_and_costs_more_than_any_completed_flight() -> None:
-    environment = made("companion/Hover-v0", action="wrench")
+    environment = made("companion/Hover-v0", action="wrench", mission=str(SHORT_CATCH))
     environment.reset(seed=1)
     generator, over = np.random.default_rng(1), False
     while not over:

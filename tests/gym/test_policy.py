@@ -28,6 +28,8 @@ from sitl.gym.environment import FlightEnvironment
 from sitl.gym.export import mark, write_policy
 from tests.support import HOVER, ROOT, SHORT_CATCH
 
+pytestmark = pytest.mark.usefixtures("short_start")
+
 STEPS, TICKS = 30, 600
 
 
