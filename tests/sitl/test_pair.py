@@ -109,7 +109,7 @@ def test_a_hold_of_both_ends_at_one_instant_once_each_that_was_commanded_is_resu
 def test_members_that_are_far_apart_in_their_plans_do_not_continue_but_set_the_bar_down_when_the_hold_expires() -> None:
     """What the left one announces is 5 s ahead: followed, the right one would leave its end of the bar."""
     commands: Commands = ({10.8: OperatorCommand.HOLD, 11.1: OperatorCommand.RESUME}, {})
-    team = team_of("vehicle.safety.hold_max_s=0.7", commands=commands)
+    team = team_of("vehicle.safety.hold_max_s=1.2", commands=commands)
     left = team.flights[0]
     announced = left.announced
 
@@ -120,7 +120,7 @@ def test_members_that_are_far_apart_in_their_plans_do_not_continue_but_set_the_b
         return replace(said, together=replace(said.together, plan_s=said.together.plan_s + 5.0))
 
     left.announced = ahead  # type: ignore[method-assign]
-    result = team.run(14.6)
+    result = team.run(15.1)
     for member in result.members:
         assert "goes_on" not in ids(member)
     assert "hold_expired" in ids(result.members[0])
