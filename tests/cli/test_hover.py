@@ -26,11 +26,11 @@ ERROR = 0.05
 
 
 @pytest.fixture(scope="module")
-def flown() -> tuple[FlightLog, float]:
+def flown(short_start: None) -> tuple[FlightLog, float]:
     """A flight, and the true hover thrust of its world."""
     flight = FastFlight(load_sitl("configs/missions/catch.yaml", overrides=(f"world.hover_thrust_error={ERROR}",)))
     truth = flight.plant.machine.hover_command
-    return log_of(flight.config, flight.run(until_mission_s=11.0), None), truth
+    return log_of(flight.config, flight.run(until_mission_s=9.0), None), truth
 
 
 @pytest.fixture(scope="module")
