@@ -98,6 +98,8 @@ class VehicleControl:
         self._pull = DisturbanceObserver(
             vehicle.airframe.mass_kg, (PULL_TIME_S, PULL_TIME_S, PULL_TIME_S), PULL_LAG_S, PULL_MAX_N
         )
+        self.force_n: Vec3 | None = None
+        """Force on the tool in the law's last tick, as the law used it or the observer estimated it, world frame; None if unknown."""
         self.disturbance_world_n: Vec3 | None = None
         """Force on the vehicle other than rotor thrust and weight, payload included, world frame, N. None on the ground."""
         self._known_n: Vec3 = (0.0, 0.0, 0.0)
@@ -232,8 +234,9 @@ class VehicleControl:
             friction = None if force is None else across(force, pressing)
             attitude = self._slide.attitude(dt_s, attitude, state, reference, friction)
         torque = self._sent(i.t_s, torque, arm_rad, vehicle)
+        self.force_n = None if force is None else log.force_ext_world_n
         if self._observer is not None:
-            observed = self._observer.force_n
+            self.force_n = observed = self._observer.force_n
             log = msgspec.structs.replace(log, force_observed_world_n=observed, force_measured_world_n=force)
         elif pressing is not None:
             log = msgspec.structs.replace(log, force_measured_world_n=force)

@@ -223,7 +223,7 @@ class FlightCore:
             thrust_share=self._control.thrust_share,
             pose_s=self._pose_s,
             dt_s=dt_s,
-            force_world_n=self._control.force_on_tool_n(i) if self._log is None else force_on_tool_n(self._log),
+            force_world_n=self._control.force_on_tool_n(i) if self._log is None else self._control.force_n,
             disturbance_world_n=None if self._observes or self._log is None else self._control.disturbance_world_n,
             position_error_m=_NO_ERROR
             if self._log is None
@@ -363,11 +363,6 @@ class FlightCore:
 
 def _accelerates(reference: Reference | None) -> bool:
     return reference is not None and math.hypot(*reference.acceleration_world_m_s2) > _CHASE_M_S2
-
-
-def force_on_tool_n(log: ControlLog) -> Vec3:
-    """Return the force on the tool that a tick of the control law measured or, without a force sensor, observed."""
-    return log.force_ext_world_n if log.force_observed_world_n is None else log.force_observed_world_n
 
 
 def within_friction(into_world: Vec3, most_n: float, force_world_n: Vec3) -> Vec3:

@@ -28,8 +28,6 @@ class HeldBar(Record, frozen=True, kw_only=True):
     """Height of the clamp's centre above the floor at which the bar stands on its feet."""
     let_go_m: float
     """Height of the clamp's centre below which the bar may be let go before it stands."""
-    weight_n: float
-    """Measured downward force of the bar on the clamp, low-passed."""
 
 
 class Expectation(Record, frozen=True):
@@ -87,7 +85,9 @@ class Observation(Record, frozen=True):
     dt_s: float
     """Time since the previous tick."""
     force_world_n: Vec3 | None
-    """Force on the tool in the last tick, world frame; if the law did not run, the measured one, and None if there is none."""
+    """Force on the tool in the last tick, world frame; if the law did not run, the measured one. None if it is not known: an unmeasured
+    force is not a force of 0.
+    """
     disturbance_world_n: Vec3 | None
     """Force on the vehicle that its motion shows, world frame; None on the ground, if the law did not run, and if it is the force on
     the tool as well.

@@ -95,10 +95,12 @@ class PartnerState(Record, frozen=True, kw_only=True):
 class CarryState(Record, frozen=True, kw_only=True):
     """How a member carries its end of the bar, for the log and the displays."""
 
-    tension_n: float
-    """Measured force of the bar on the clamp, towards the other end, less what accelerates the bar; low-passed."""
-    weight_n: float
-    """Measured downward force of the bar on the clamp, low-passed."""
+    tension_n: float | None
+    """Measured force of the bar on the clamp, towards the other end, less what accelerates the bar; low-passed. None while the force is
+    not known.
+    """
+    weight_n: float | None
+    """Measured downward force of the bar on the clamp, low-passed; None while the force is not known."""
     offset_m: float
     """Offset of the reference along the bar, towards the other end."""
     rate_m_s: float

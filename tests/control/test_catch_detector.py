@@ -6,12 +6,15 @@ import math
 from collections.abc import Callable
 
 import pytest
+from msgspec.structs import replace
 
 from companion.control.sensing import CatchDetector, ObservedCatchDetector
 from companion.control.vehicle_control import VehicleControl
-from companion.model.types import Vec3
+from companion.mission.plan import Plan
+from companion.model.types import Inputs, Vec3
 from companion.sitl_config.loader import load_sitl
 from tests.safety.healthy import control as log_of
+from tests.safety.healthy import healthy, put
 
 DT_S = 0.005
 G_M_S2 = 9.81
@@ -61,6 +64,26 @@ def test_an_arm_that_swings_confirms_no_catch(swings: bool) -> None:
         force = EMPTY if tick < 200 else (-6.0, 0.5, -9.0) if tick < 208 else (0.0, 0.0, -1.96)
         caught.append(control.catch_s(tick * DT_S, log_of(force_ext_world_n=force), swings))
     assert [caught_s for caught_s in caught if caught_s is not None] == ([] if swings else [200 * DT_S])
+
+
+def test_a_force_is_unknown_before_the_tare_and_once_it_is_old() -> None:
+    """0.25 s is `safety.force_timeout_s`. Unknown is not 0: a bar would seem lost, a surface not touched."""
+    config = load_sitl("configs/missions/catch.yaml", overrides=["vehicle.airframe.hover_thrust=0.5"])
+    control, now = VehicleControl(config.flight), healthy()
+    reference = Plan.build(config.mission, config.vehicle).reference(0.0)
+
+    def known(i: Inputs) -> bool:
+        control.fly(i, DT_S, reference, 1.0)
+        assert (control.force_n is None) is (control.force_on_tool_n(i) is None)
+        return control.force_n is not None
+
+    assert not known(now)
+    control.collect_tare(now)
+    control.finish_tare()
+    assert known(now)
+    assert known(put("force", stamp_s=now.t_s - 0.24)(now))
+    assert not known(put("force", stamp_s=now.t_s - 0.26)(now))
+    assert not known(replace(now, force=None))
 
 
 @pytest.mark.parametrize("payload_kg", [0.05, 0.1, 0.2, 0.3, 0.6])

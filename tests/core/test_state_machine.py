@@ -9,7 +9,6 @@ import msgspec
 import pytest
 
 from companion.core import flight_core
-from companion.core.flight_core import force_on_tool_n
 from companion.core.flight_state import FlightState, Request
 from companion.core.state_machine import transition
 from companion.core.transition import Parameters
@@ -56,7 +55,7 @@ def assert_observes_the_tick_before(outputs: list[Outputs], observations: list[O
         log = before.control
         if log is not None:
             assert (*o.position_error_m, o.yaw_error_rad) == (*log.error[:3], log.error[5])
-            assert o.force_world_n == force_on_tool_n(log)
+            assert o.force_world_n == (log.force_observed_world_n or log.force_ext_world_n)
         if before.reference is not None:
             assert o.reference is before.reference
         assert o.dt_s == pytest.approx(o.inputs.t_s - before.t_s)

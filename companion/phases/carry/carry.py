@@ -83,7 +83,11 @@ class Carrying(Record, frozen=True, kw_only=True):
     """State of the phase."""
 
     bar: HeldBar
+    weight_n: float = 0.0
+    """Measured downward force of the bar on the clamp, low-passed."""
     tension_n: float = 0.0
+    felt: bool = True
+    """Whether the force is known. If it is not, the bar's weight is not judged, and the vehicle returns to its path and keeps to it."""
     offset_m: float = 0.0
     rate_m_s: float = 0.0
     acceleration_m_s2: float = 0.0
@@ -182,10 +186,11 @@ class Carry(Phase):
         left = 1.0 - rest_to_rest(min(1.0, (air.t_s - s.begun_s) / self.lift_s))[0]
         s = self._yielding(air, replace(s, pose=pose, along_world=along, share=left))
         lifted = pose[2] > s.bar.stands_m + LIFTED_M
-        s = replace(s, light_s=min(s.light_s, air.t_s) if lifted and s.bar.weight_n < WEIGHT_MIN_N else math.inf)
+        light = lifted and s.felt and s.weight_n < WEIGHT_MIN_N
+        s = replace(s, light_s=min(s.light_s, air.t_s) if light else math.inf)
         if air.t_s - s.light_s > LIGHT_S:
             air.report(
-                BAR_LOST, f"the bar weighs {max(0.0, s.bar.weight_n):.1f} N at this end (minimum {WEIGHT_MIN_N:g} N)"
+                BAR_LOST, f"the bar weighs {max(0.0, s.weight_n):.1f} N at this end (minimum {WEIGHT_MIN_N:g} N)"
             )
         if s.arrived_s == math.inf:
             grip = grip_of(air.phases[: air.engaged.index])
@@ -225,8 +230,8 @@ class Carry(Phase):
             bar=s.bar,
             together=s.together,
             carry=CarryState(
-                tension_n=s.tension_n,
-                weight_n=s.bar.weight_n,
+                tension_n=s.tension_n if s.felt else None,
+                weight_n=s.weight_n if s.felt else None,
                 offset_m=s.offset_m,
                 rate_m_s=s.rate_m_s,
                 centre_world_m=(x, y, z),
@@ -263,23 +268,20 @@ class Carry(Phase):
 
     def _yielding(self, air: Air, s: Carrying) -> Carrying:
         """Return the state whose reference yields to the force along the bar."""
-        force, dt_s = air.o.force_world_n, air.dt_s
-        if force is None:
-            return s
-        share = dt_s / (dt_s + FORCE_FILTER_S)
-        weight_n = s.bar.weight_n + share * (-force[2] - s.bar.weight_n)
-        reference = air.o.reference
-        inertial_n = (
-            0.0
-            if reference is None
-            else weight_n / GRAVITY_M_S2 * dot(reference.acceleration_world_m_s2, s.along_world)
-        )
-        tension_n = s.tension_n + share * (dot(force, s.along_world) + inertial_n - s.tension_n)
-        s = replace(s, bar=replace(s.bar, weight_n=weight_n), tension_n=tension_n)
-        c = self.compliance
+        force, dt_s, c = air.o.force_world_n, air.dt_s, self.compliance
+        s = replace(s, felt=force is not None)
+        if force is not None:
+            share = dt_s / (dt_s + FORCE_FILTER_S)
+            weight_n = s.weight_n + share * (-force[2] - s.weight_n)
+            r = air.o.reference
+            inertial_n = 0.0 if r is None else weight_n / GRAVITY_M_S2 * dot(r.acceleration_world_m_s2, s.along_world)
+            tension_n = s.tension_n + share * (dot(force, s.along_world) + inertial_n - s.tension_n)
+            s = replace(s, weight_n=weight_n, tension_n=tension_n)
         if c is None:
             return s
-        push_n = tension_n - c.tension_n - c.damping_ns_m * s.rate_m_s - c.stiffness_n_m * s.offset_m
+        push_n = (
+            (s.tension_n - c.tension_n if s.felt else 0.0) - c.damping_ns_m * s.rate_m_s - c.stiffness_n_m * s.offset_m
+        )
         acceleration = push_n / c.mass_kg
         rate = s.rate_m_s + dt_s * acceleration
         offset = s.offset_m + dt_s * rate

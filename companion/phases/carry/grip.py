@@ -214,7 +214,7 @@ class GripHandle(Phase):
     def held(self) -> HeldBar:
         """Return what a landing must know of the bar."""
         stands_m = self.bar.handle_height_m
-        return HeldBar(stands_m=stands_m, let_go_m=stands_m + self.let_go_height_m, weight_n=0.0)
+        return HeldBar(stands_m=stands_m, let_go_m=stands_m + self.let_go_height_m)
 
     def _at_handle_since_s(self, air: Air, s: Gripping) -> float:
         return math.inf if math.hypot(*s.beside_m) > self.tolerance_m else min(s.at_handle_s, air.t_s)

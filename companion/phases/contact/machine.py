@@ -64,7 +64,7 @@ def advance(
         if contact.mode is _RETURN and c.is_shifted(contact):
             air.skips_rest = contact.failed
             return None
-    elif not _is_force_known(air):
+    elif air.o.force_world_n is None:
         contact = _failed(air, contact, notices.CONTACT_LOST, "the force is not measured any more; leaving the surface")
     elif contact.mode in _MEASURING and (found := _contradiction(air, contact)) is not None:
         contact = _failed(air, contact, found[0], f"{found[1]}; leaving the surface")
@@ -169,16 +169,6 @@ def _left(contact: ContactState, t_s: float, dt_s: float, speed_m_s: float) -> C
 def _observes(air: Air) -> bool:
     """Return whether the momentum observer is the source of the force."""
     return air.vehicle.force_source == OBSERVER
-
-
-def _is_force_known(air: Air) -> bool:
-    """Return whether the force is observed, or measured and not older than `safety.force_timeout_s`: without it the approach would not
-    end at the surface.
-    """
-    vehicle, force = air.vehicle, air.i.force
-    if _observes(air):
-        return True
-    return force is not None and air.t_s - force.stamp_s <= vehicle.safety.force_timeout_s
 
 
 def _contradiction(air: Air, contact: ContactState) -> tuple[EventDefinition, str] | None:
