@@ -7,8 +7,8 @@ from companion.model.codec import Record
 WATCHED_RATE_HZ = 20.0
 """Requested rate of ESTIMATOR_STATUS if another program feeds PX4 with poses: the report alone shows whether PX4 uses them."""
 # ESTIMATOR_STATUS_FLAGS of position and height that EKF2 sets while measurements support them. Measured on PX4 1.16.1: they are cleared
-# about 0.5 s after the last pose, those of a valid position only after 4.5 s. With a
-# barometer (EKF2_BARO_CTRL 1), that of height stays.
+# about 0.5 s after the last pose, those of a valid position 0.58 s before EKF2_NOAID_TOUT ends. With a barometer (EKF2_BARO_CTRL 1),
+# that of height stays.
 _AIDED = {256: "horizontal position", 32: "height"}
 
 

@@ -76,7 +76,14 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
         _advised(
             "EKF2_BARO_CTRL",
             1,
-            "without it, PX4 has no height 4.5 s after motion capture is lost: it descends blindly and finds the floor late or never",
+            "without it, PX4 has no height 1.4 s after motion capture is lost: it descends blindly and finds the floor late or never",
+        ),
+        Wanted(
+            "EKF2_NOAID_TOUT",
+            2_000_000,
+            "time without motion capture after which PX4 descends level, us; on its dead-reckoned velocity it would lean on the floor, "
+            "and tip over",
+            limits=(1_000_000, 2_500_000),
         ),
         Wanted(
             "EKF2_MAG_TYPE",

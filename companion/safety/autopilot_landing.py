@@ -1,12 +1,12 @@
 """Landing in PX4's LAND mode, supervised by the companion, which completes what PX4 cannot.
 
-PX4 lands using its own estimate. Without vision its height becomes invalid 4.5 s after the last pose; from then on it descends at
-constant thrust and never detects the ground (measured). The companion therefore watches for touchdown as long as the dead-reckoned
-height is valid, returns PX4 to OFFBOARD with zero thrust once the vehicle has landed, and disarms. No single source decides: PX4's
-estimate and motion capture must both show a vehicle at rest while PX4 descends. Poses that are too late for PX4 still show where the
-vehicle was: they show a touchdown that a drifting estimate does not. The vehicle is disarmed even if PX4's land detector alone does
-not respond. `companion.safety.rotor_stop` decides when a stop of the rotors may be requested, including that of a vehicle
-that is flipped or tipped over. Pure; time is an argument.
+PX4 lands using its own estimate. Without vision, and without a barometer, its height becomes invalid 1.4 s after the last pose
+(EKF2_NOAID_TOUT); from then on it descends at constant thrust and never detects the ground (measured). The companion therefore
+watches for touchdown as long as the dead-reckoned height is valid, returns PX4 to OFFBOARD with zero thrust once the vehicle
+has landed, and disarms. No single source decides: PX4's estimate and motion capture must both show a vehicle at rest while PX4
+descends. Poses that are too late for PX4 still show where the vehicle was: they show a touchdown that a drifting estimate does
+not. The vehicle is disarmed even if PX4's land detector alone does not respond. `companion.safety.rotor_stop` decides when a
+stop of the rotors may be requested, including that of a vehicle that is flipped or tipped over. Pure; time is an argument.
 """
 
 from __future__ import annotations

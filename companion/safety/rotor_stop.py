@@ -40,7 +40,7 @@ DISARM_STILL_S: Final = 0.35
 FORCE_DISARM_S: Final = 4.0
 """Time at rest after which the vehicle is disarmed although PX4's land detector reports no landing."""
 ESTIMATE_TRUSTED_S = 4.2
-"""Time after the last motion-capture pose for which PX4's dead-reckoned height counts. PX4 drops it after 4.5 s."""
+"""Time after the last motion-capture pose for which PX4's dead-reckoned height counts; later it is too wrong."""
 STATE_FRESH_S = 0.3
 FLIPPED_TILT_RAD = math.radians(70.0)
 FLIPPED_HOLD_S: Final = 0.3

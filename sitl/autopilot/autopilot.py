@@ -150,7 +150,7 @@ class Px4Stub:
         if imu.baro_m is not None and self.params.integer("EKF2_BARO_CTRL"):
             descends = self.armed and self.nav_state in (NavState.LAND, NavState.DESCEND)
             self._estimator.fuse_barometer(imu.baro_m, descends)
-        self.estimate = estimate = self._estimator.estimate()
+        self.estimate = estimate = self._estimator.estimate(1e-6 * self.params.integer("EKF2_NOAID_TOUT"))
         queue = self._queue
         while queue and queue[0][0] <= t_s + _TIME_EPSILON_S:
             self._offboard = queue.popleft()[1]

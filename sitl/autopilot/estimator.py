@@ -17,7 +17,8 @@ from companion.model.types import IDENTITY_QUAT, Quat, Vec3
 from sitl.autopilot.types import Estimate, Fusion, ImuSample
 
 VISION_FUSED_TIMEOUT_S: Final = 0.55
-POSITION_VALID_TIMEOUT_S: Final = 4.5
+POSITION_DROPS_EARLIER_S: Final = 0.58
+"""PX4 drops its position this much less than EKF2_NOAID_TOUT after the last pose: 0.43, 0.92 and 1.42 s with 1, 1.5 and 2 s."""
 _HISTORY_S: Final = 0.3
 _GATE_M: Final = 0.5
 _GATE_RESET_S: Final = 1.0
@@ -230,10 +231,11 @@ class Estimator:
             v = 0.0 if math.isnan(v) else 0.5 * v
         return Fusion(h, v, sigma_m, sigma_m)
 
-    def estimate(self) -> Estimate:
-        """Return the newest estimate."""
+    def estimate(self, dead_reckons_s: float = 5.0) -> Estimate:
+        """Return the newest estimate, whose position is valid for `dead_reckons_s` (EKF2_NOAID_TOUT) after vision was last fused."""
         t_s = self._t_s or 0.0
         since = t_s - self._fused_t_s if self._fused_t_s is not None else math.inf
+        valid = since <= dead_reckons_s - POSITION_DROPS_EARLIER_S
         return Estimate(
             t_s=t_s,
             position_ned_m=self._p,
@@ -242,8 +244,8 @@ class Estimator:
             rates_frd_rad_s=self._rates,
             accel_frd_m_s2=self._accel,
             vision_fused=since <= VISION_FUSED_TIMEOUT_S,
-            position_valid=since <= POSITION_VALID_TIMEOUT_S,
-            height_valid=since <= POSITION_VALID_TIMEOUT_S or self._baro_t_s is not None,
+            position_valid=valid,
+            height_valid=valid or self._baro_t_s is not None,
             attitude_valid=self._tilt_aligned,
             height_aided=since <= VISION_FUSED_TIMEOUT_S or self._baro_t_s is not None,
         )

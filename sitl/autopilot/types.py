@@ -41,7 +41,7 @@ class Estimate(NamedTuple):
     vision_fused: bool
     """Whether vision was fused within the last 0.55 s (like PX4's EV flags)."""
     position_valid: bool
-    """xy_valid of vehicle_local_position: true until 4.5 s after vision was last fused."""
+    """xy_valid of vehicle_local_position: true until EKF2_NOAID_TOUT less 0.58 s after vision was last fused."""
     height_valid: bool
     """z_valid: as long, and longer with a barometer."""
     attitude_valid: bool

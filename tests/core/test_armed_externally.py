@@ -179,7 +179,7 @@ def flown(
     ("mission", "died_s", "gone_s"), [(CATCH, 5.2, 8.0), (SHORT_CATCH, 5.8, 0.1), (SHORT_CATCH, 5.8, 2.5)]
 )
 def test_started_again_in_the_air_it_lands_what_still_flies(mission: Path, died_s: float, gone_s: float) -> None:
-    """PX4 has been without motion capture and has no barometer: after 4.5 s it descends blindly and never finds that it stands."""
+    """PX4 has been without motion capture and has no barometer: after 1.4 s it descends blindly and never finds that it stands."""
     flight, result = flown(died_s, died_s + gone_s, mission=mission)
     after = [o for o in result.outputs if o.t_s >= died_s + gone_s]
     assert ids(after)[0] == "armed_externally"

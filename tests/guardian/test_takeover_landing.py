@@ -426,7 +426,7 @@ def test_poses_that_the_flight_process_rejected_are_neither_passed_on_nor_evalua
 
 
 def test_a_height_by_dead_reckoning_is_vouched_for_once_and_not_anew_in_each_round() -> None:
-    """PX4 drops its height 4.5 s after the last pose, so it proves nothing in the second attempt of 30 s."""
+    """PX4 drops its height soon after the last pose, so it proves nothing in the second attempt of 30 s."""
     landing = Landing(beat())
     landing.run(TIMEOUT_S + 1.0, height_m=2.0, mocap=False)
     assert not landing.zero_thrust

@@ -34,7 +34,7 @@ REQUIRED: dict[str, tuple[SafetyAction | None, SafetyAction | None, float]] = {
     "operator_abort": (LAND, LAND, 0.015),
     "killed": (PX4_LANDS, PX4_LANDS, 0.015),  # whatever is sent after it would act when the switch is released
     "armed_externally": (LAND, PX4_LANDS, 0.000),  # on the ground it is disarmed; in the air nobody else lands it
-    "mocap_lost": (PX4_LANDS, PX4_LANDS, 0.220),  # PX4's estimate holds for 4.5 s, the companion has none
+    "mocap_lost": (PX4_LANDS, PX4_LANDS, 0.220),  # PX4's estimate holds for 1.4 s, the companion has none
     "mocap_invalid": (PX4_LANDS, PX4_LANDS, 0.210),
     "mocap_swapped": (PX4_LANDS, PX4_LANDS, 0.210),
     "mocap_jump": (WARN, WARN, 0.500),

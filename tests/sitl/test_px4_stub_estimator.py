@@ -74,6 +74,17 @@ def test_the_barometer_is_the_height_only_without_vision_and_its_offset_is_known
     assert estimator.estimate().height_valid and not estimator.estimate().position_valid
 
 
+@pytest.mark.parametrize(("noaid_tout_us", "valid_s"), [(1_000_000, 0.43), (2_000_000, 1.42), (5_000_000, 4.42)])
+def test_the_position_is_dropped_as_long_after_the_last_pose_as_on_px4(noaid_tout_us: int, valid_s: float) -> None:
+    """Measured on PX4 1.16.1; the last one was computed from the others."""
+    rig = Rig({"EKF2_NOAID_TOUT": noaid_tout_us})
+    rig.run(2.0)
+    rig.vision, begun_s = False, rig.t_s
+    while rig.stub.estimate is not None and rig.stub.estimate.position_valid:
+        rig.step()
+    assert rig.t_s - begun_s == pytest.approx(valid_s, abs=0.03)
+
+
 def test_while_px4_lands_a_barometer_that_shows_less_is_not_believed() -> None:
     heights = []
     for descends in (False, True):

@@ -114,7 +114,7 @@ def test_land_of_1_18_ends_the_acceleration_of_its_beginning_at_mpc_jerk_auto_on
 
 def test_a_landing_that_ends_before_the_estimate_expires_disarms() -> None:
     """Without a height PX4 wants 8 s of idle thrust to believe that it has landed; the rotors stay idle meanwhile."""
-    rig = hovering(EKF2_BARO_CTRL=0)
+    rig = hovering(EKF2_BARO_CTRL=0, EKF2_NOAID_TOUT=5_000_000)
     rig.vision = False
     rig.run(0.15)
     rig.command(Command.NAV_LAND)
@@ -134,7 +134,7 @@ def test_with_a_barometer_that_is_a_metre_off_it_finds_the_floor_after_the_posit
     rig.run(20.0)
     assert rig.height_m == pytest.approx(1.0, abs=0.15), "poses hold the height"
     rig.vision = False
-    rig.run(4.6)
+    rig.run(1.6)
     assert rig.stub.estimate is not None and rig.stub.estimate.height_valid and not rig.stub.estimate.position_valid
     assert rig.stub.nav_state is NavState.DESCEND
     run_until(rig, lambda: rig.stub.landed, 6.0)
