@@ -251,13 +251,15 @@ class FlightCore:
             tool_n = log.force_measured_world_n if expected.touches or self._observes else log.force_ext_world_n
         if tool_n is not None and into is not None and expected.friction_max_n is not None:
             tool_n = within_friction(into, expected.friction_max_n, tool_n)
+        # The bar's force, if it is not known, would seem to be the tether's.
+        bar_unfelt = self._state.bar is not None and self._control.force_n is None
         self._context.tether = state = watch.update(
             i.t_s,
             v.position_world_m,
             v.velocity_world_m_s,
             v.attitude_wxyz,
             i.arm.angle_rad if i.arm is not None else None,
-            self._control.disturbance_world_n if flying else None,
+            self._control.disturbance_world_n if flying and not bar_unfelt else None,
             tool_n,
         )
         if self._observes:

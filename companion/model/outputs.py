@@ -101,7 +101,9 @@ class TetherState(Record, frozen=True, kw_only=True):
     turns: float
     """Winding of the tether about the vertical through the anchor, in turns; positive counter-clockwise as seen from above."""
     pull_n: float
-    """Low-pass-filtered force toward the anchor that is not due to the rotors, gravity or the tool; 0 if unknown, never negative."""
+    """Low-pass-filtered force toward the anchor that is not due to rotors, gravity or the tool, or the horizontal one while that counts
+    as a snag; 0 if unknown, never negative.
+    """
     taut: bool
     """Whether the slack is used up."""
     snagged: bool

@@ -63,6 +63,7 @@ class PullEstimate:
         self._moved_m = 0.0
         """Distance that the vehicle has moved along the present pull."""
         self.pull_n = 0.0
+        """Pull towards the anchor, or the whole horizontal pull while there is one in any direction."""
         self.pulling = False
         """Whether there is a pull towards the anchor."""
         self.sideways = False
@@ -107,8 +108,6 @@ class PullEstimate:
         if weight <= 0.0:
             return  # at the anchor: no direction
         pull = ((ux * fx + uy * fy) * _FLAT + uz * fz * _STEEP) / weight
-        self.pull_n = pull
-
         least = max(self._min_n, CERTAIN / math.sqrt(weight))
         self._pull_s = self._pull_s + dt_s if pull > (RELEASE * least if self.pulling else least) else 0.0
         self.pulling = self._pull_s > 0.0 and (self.pulling or self._pull_s >= self._after_s)
@@ -116,6 +115,7 @@ class PullEstimate:
         limit = RELEASE * SIDEWAYS_N if self.sideways else SIDEWAYS_N
         self._side_s = self._side_s + dt_s if side_2 > limit * limit else 0.0
         self.sideways = self._side_s > 0.0 and (self.sideways or self._side_s >= self._after_s)
+        self.pull_n = max(pull, math.sqrt(side_2)) if self.sideways else pull
         if self._pull_s > 0.0 or self._side_s > 0.0:
             vx, vy, vz = velocity_world_m_s
             self._moved_m += dt_s * (vx * fx + vy * fy + vz * fz) / math.sqrt(side_2 + fz * fz)

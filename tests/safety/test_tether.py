@@ -452,7 +452,9 @@ def test_six_newtons_from_the_side_hold_the_vehicle_until_they_fall_below_3_6_ne
 
     states = pulled(6.0, force)
     assert states[-1].snagged is held
-    assert states[-1].pull_n == 0.0, "away from the anchor"
+    assert states[-1].pull_n == pytest.approx(later_n if held else 0.0, rel=0.15), (
+        "away from the anchor: 0 unless it holds"
+    )
     first = next(k for k, state in enumerate(pulled(2.0, lambda t_s, p: (60.0, 80.0, 0.0))) if state.snagged)
     assert first * DT_S == pytest.approx(tether_of(vehicle()).pull_time_s, abs=0.1), "no blow"
 
@@ -494,7 +496,7 @@ def test_wrong_hover_thrust_above_the_anchor_is_no_pull() -> None:
 def test_held_by_something_else_than_the_anchor_is_a_snag() -> None:
     states = pulled(1.5, along(12.0, to=(0.5, 1.8, 0.2)))
     assert states[-1].snagged
-    assert states[-1].pull_n == 0.0
+    assert states[-1].pull_n > 10.0, "the event once said that the tether pulls with 0 N"
 
 
 def test_without_knowledge_of_forces_there_is_no_pull() -> None:

@@ -64,9 +64,14 @@ def assert_both_have_let_go(team: FastTeam, result: TeamResult, height_m: float)
 
 @functools.cache
 def held() -> tuple[FastTeam, TeamResult]:
-    """A flight of both with a hold of each on the way: the right one holds because the left one does, and then by its own command."""
+    """A flight of both with a hold of each on the way: the right one holds because the left one does, and then by its own command. Then
+    the right one's force sensor falls silent.
+    """
     hold, resume = OperatorCommand.HOLD, OperatorCommand.RESUME
-    return flown(commands=({11.5: hold, 12.1: resume}, {11.8: hold, 12.6: resume}))
+    return flown(
+        "right.world.faults=[{kind: force_loss, t_s: 14.5}]",
+        commands=({11.5: hold, 12.1: resume}, {11.8: hold, 12.6: resume}),
+    )
 
 
 def times(member: FastResult, grip: Grip) -> list[float]:
@@ -88,6 +93,16 @@ def test_both_lift_carry_set_down_and_land() -> None:
     left, right = (times(member, Grip.CARRYING) for member in result.members)
     assert abs(left[0] - right[0]) <= 0.0051
     assert_both_down_unharmed(team)
+
+
+def test_without_the_force_of_one_the_bar_is_carried_on_and_its_pull_is_not_taken_for_the_tethers() -> None:
+    _, result = held()
+    right = result.members[1]
+    assert "force_lost" in ids(right) and not {"bar_lost", "partner_lands", "tether_snagged"} & set(ids(right))
+    lost_s = next(event.t_s for o in right.outputs for event in o.events if event.id == "force_lost")
+    carried = [o for o in right.outputs if o.team is not None and o.team.grip is Grip.CARRYING]
+    pulls_s = [o.t_s for o in carried if o.tether is not None and o.tether.pull_n > 0.0]
+    assert carried[0].t_s < pulls_s[0] and pulls_s[-1] <= lost_s < carried[-1].t_s - 0.2
 
 
 def test_a_hold_of_both_ends_at_one_instant_once_each_that_was_commanded_is_resumed() -> None:
