@@ -73,7 +73,7 @@ GROUPS: dict[str, tuple[Wanted, ...]] = {
             reboot=True,
         ),
         Wanted("EKF2_GPS_CTRL", 0, "a GPS fix through a window would shift the position estimate out of the room"),
-        _advised(
+        Wanted(
             "EKF2_BARO_CTRL",
             1,
             "without it, PX4 has no height 1.4 s after motion capture is lost: it descends blindly and finds the floor late or never",
