@@ -66,7 +66,7 @@ class FlightLog:
     closed: bool
     """Whether the recorder closed the file."""
     stride: int = 1
-    """Every `stride`-th tick and every tick with events is kept; 1 keeps all."""
+    """Every `stride`-th tick, every tick with events and the last tick are kept; 1 keeps all."""
     measured: Timing | None = None
     """Timing of all ticks; None if all ticks are kept."""
 
@@ -80,24 +80,24 @@ class FlightLog:
         """Read a log.
 
         Args:
-            part: keep only the ticks of these numbers, and those with an outcome. None keeps all.
-            ticks_max: keep about this many ticks, evenly spread (`stride`), and those with events; a tick takes about 9 kB of
-                memory. None keeps all.
+            part: keep only the ticks of these numbers, and the last one. None keeps all.
+            ticks_max: keep about this many ticks, evenly spread (`stride`), those with events, and the last one; a tick takes
+                about 9 kB of memory. None keeps all.
 
         Raises:
             LogError: the file does not exist, is not MCAP, was not written by the recorder, is damaged, has metadata with invalid
                 values, or has records whose fields differ from those of this version. An optional field that an older log lacks is
                 read as None.
         """
-        reading, rows = _Reading(path), _Rows(ticks_max)
+        reading, rows = _Reading(path), _Rows(ticks_max, part)
         for row in reading.ticks():
-            if part is None or row[0].tick in part or row[1].outcome is not None:
-                rows.take(row)
+            rows.take(row)
+        kept = rows.with_the_last()
         log = FlightLog(
             path=path,
-            inputs=tuple(row[0] for row in rows.kept),
-            outputs=tuple(row[1] for row in rows.kept),
-            sent=tuple(row[2] for row in rows.kept),
+            inputs=tuple(row[0] for row in kept),
+            outputs=tuple(row[1] for row in kept),
+            sent=tuple(row[2] for row in kept),
             metadata=reading.metadata,
             closed=reading.closed,
             stride=rows.stride,
@@ -289,29 +289,40 @@ class _Reading:
 class _Rows:
     """Keeps ticks, and thins them out when there are too many."""
 
-    def __init__(self, ticks_max: int | None) -> None:
+    def __init__(self, ticks_max: int | None, part: range | None) -> None:
         self._ticks_max = ticks_max
+        self._part = part
         self._stopwatch = Stopwatch() if ticks_max is not None else None
-        self.kept: list[Row] = []
+        self._kept: list[Row] = []
+        self._spread = 0
+        """Number of kept ticks that are kept for their number: only these become fewer when the stride grows."""
+        self._last: Row | None = None
         self.stride = 1
 
     def take(self, row: Row) -> None:
         """Add the next tick of the file."""
-        inputs, _, sent = row
+        self._last = row
         if self._stopwatch is not None:
-            self._stopwatch.take(inputs, sent)
-        if self._wanted(row):
-            self.kept.append(row)
-            self._thin_out()
-
-    def _wanted(self, row: Row) -> bool:
-        inputs, outputs, _ = row
-        return inputs.tick % self.stride == 0 or bool(outputs.events) or outputs.outcome is not None
-
-    def _thin_out(self) -> None:
-        if self._ticks_max is not None and len(self.kept) > self._ticks_max:
+            self._stopwatch.take(row[0], row[2])
+        self._keep(row)
+        if self._ticks_max is not None and self._spread > self._ticks_max:
             self.stride *= 2
-            self.kept = [row for row in self.kept if self._wanted(row)]
+            rows, self._kept, self._spread = self._kept, [], 0
+            for kept in rows:
+                self._keep(kept)
+
+    def with_the_last(self) -> list[Row]:
+        """Return the kept ticks and the last one, which has the outcome."""
+        if self._last is None or (self._kept and self._kept[-1] is self._last):
+            return self._kept
+        return [*self._kept, self._last]
+
+    def _keep(self, row: Row) -> None:
+        tick, part = row[0].tick, self._part
+        spread = tick % self.stride == 0 and (part is None or tick in part)
+        if spread or (part is None and row[1].events):
+            self._kept.append(row)
+            self._spread += spread
 
     @property
     def measured(self) -> Timing | None:

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from companion.analysis import tables
 from companion.analysis.export import write_lerobot, write_tables
 from companion.analysis.hover_fit import fit_hover_thrust
-from companion.analysis.log import TICKS_KEPT, FlightLog
+from companion.analysis.log import TICKS_KEPT, FlightLog, Row, _Rows
 from companion.analysis.metrics import catch_index
 from companion.analysis.replay import replay
 from companion.analysis.report import write_report
@@ -62,6 +62,30 @@ def test_every_event_is_kept_and_so_is_the_outcome(whole: FlightLog, thin: Fligh
 
     assert told(thin) == told(whole)
     assert [o.outcome for o in thin.outputs if o.outcome] == [o.outcome for o in whole.outputs if o.outcome]
+
+
+@pytest.mark.parametrize("name", ["outcome", "events"])
+def test_many_ticks_with_an_outcome_or_events_are_looked_at_a_few_times_each(
+    name: str, whole: FlightLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stride that grew at each of these ticks went through all kept ticks each time."""
+    ticks, looks, keep = 10 * TICKS, 0, _Rows._keep
+
+    def counted(rows: _Rows, row: Row) -> None:
+        nonlocal looks
+        looks += 1
+        keep(rows, row)
+
+    monkeypatch.setattr(_Rows, "_keep", counted)
+    special = next(o for o in whole.outputs if getattr(o, name))
+    special = special if name == "events" else replace(special, events=())
+    rows = _Rows(TICKS, None)
+    for tick in range(ticks):
+        rows.take((replace(whole.inputs[0], tick=tick), special, whole.sent[0]))
+    assert looks < 10 * ticks
+    assert rows.stride == 16
+    kept = [inputs.tick for inputs, _, _ in rows.with_the_last()]
+    assert kept == (list(range(ticks)) if name == "events" else [*range(0, ticks, 16), ticks - 1])
 
 
 def test_timing_is_that_of_every_tick(whole: FlightLog, thin: FlightLog) -> None:
