@@ -73,9 +73,8 @@ def fit_hover_thrust(log: FlightLog) -> HoverFit:
     dt_s, thrust, load, voltage_v = samples.T
     used_s = float(dt_s.sum())
     if used_s < FIT_MIN_S:
-        raise HoverFitError(
-            f"{log.path}: {used_s:.1f} s of steady flight, expected {FIT_MIN_S:g} s or more; hover for a few seconds"
-        )
+        what = "hover for a few seconds" if log.end_missing is None else log.end_missing
+        raise HoverFitError(f"{log.path}: {used_s:.1f} s of steady flight, expected {FIT_MIN_S:g} s or more; {what}")
     pieces = np.floor(np.cumsum(dt_s) / PIECE_S)
     ones = np.ones((len(load), 1))
     values, errors = _fit(dt_s, load[:, None], ones, thrust, pieces)

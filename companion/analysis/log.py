@@ -26,8 +26,9 @@ from companion.config.loader import FlightConfig, logged_flight
 from companion.model.arm_skeleton import ArmSkeleton, logged_skeleton
 from companion.model.codec import RecordError, from_json
 from companion.model.outputs import Outputs, Sent
-from companion.model.types import Inputs
+from companion.model.types import Inputs, Outcome
 from companion.plugins import PluginError
+from companion.runtime.console import print_error
 
 TICKS_KEPT = 20_000
 """Ticks that commands keep in memory which need every tick: they read a longer log again, tick by tick."""
@@ -74,6 +75,26 @@ class FlightLog:
     def clock(self) -> str:
         """Return the clock by which the flight ran: `simulated` or `real`. In simulated time its latencies are zero."""
         return self.metadata.get("flight", {}).get("clock", "real")
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """Return the outcome; None if the log ends before it, as that of a flight whose process was killed."""
+        return next((outputs.outcome for outputs in reversed(self.outputs) if outputs.outcome is not None), None)
+
+    @property
+    def end_missing(self) -> str | None:
+        """Return in one line what the log's end lacks; None if the recorder closed it after the flight's outcome."""
+        if not self.inputs:
+            return None if self.closed else "the log was not closed and has no ticks"
+        last = f"its last whole tick is at t = {self.inputs[-1].t_s:.3f} s"
+        if self.outcome is None:
+            return f"the log ends before the flight did: {last}, the outcome is not in it"
+        return None if self.closed else f"the log was not closed: {last}, the outcome is in it"
+
+    def report_missing_end(self) -> None:
+        """Print to standard error what the log's end lacks, if it lacks anything."""
+        if self.end_missing is not None:
+            print_error(f"{self.path}: {self.end_missing}")
 
     @staticmethod
     def read(path: Path, *, ticks_max: int | None = None, part: range | None = None) -> FlightLog:
@@ -283,7 +304,10 @@ class _Reading:
         except (McapError, ZstdError, RuntimeError, MemoryError, struct.error, ValueError, KeyError) as error:
             raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
         if "companion" not in metadata:
-            raise LogError(f"{path}: an MCAP file, but not a flight log: it has no 'companion' metadata record")
+            what = (
+                "an MCAP file, but not a flight log" if self.closed else "not a flight log, or cut off at its beginning"
+            )
+            raise LogError(f"{path}: {what}: it has no 'companion' metadata record")
 
 
 class _Rows:

@@ -112,7 +112,7 @@ def check_replayable(log: FlightLog) -> str:
     if config_json is None:
         raise LogError(f"{log.path}: has no configuration (metadata record 'config'); it cannot be replayed")
     if not log.inputs:
-        raise LogError(f"{log.path}: has no ticks")
+        raise LogError(f"{log.path}: {log.end_missing or 'has no ticks'}")
     first, missing = log.timing.first_tick, log.missing_ticks()
     if first != 0 or missing:
         what = (
@@ -151,14 +151,16 @@ def flight_core(config_json: str) -> Core:
 
 
 def run(path: Path) -> int:
-    """Run `companion replay FILE`: 0 if every output is bit-identical, 1 if not, 2 if the log cannot be replayed."""
+    """Run `companion replay FILE`: 0 if every output in the log is bit-identical, 1 if not, 2 if the log cannot be replayed."""
     try:
-        result = replay(FlightLog.read(path, ticks_max=TICKS_KEPT), flight_core)
+        log = FlightLog.read(path, ticks_max=TICKS_KEPT)
+        result = replay(log, flight_core)
     except LogError as error:
         print(error, file=sys.stderr)
         return 2
+    end = f"; {log.end_missing}" if log.end_missing is not None else ""
     if result.first_difference is not None:
-        print(f"{path}: differs at {result.first_difference}")
+        print(f"{path}: differs at {result.first_difference}{end}")
         return 1
-    print(f"{path}: {result.ticks} ticks replayed, every output bit-identical")
+    print(f"{path}: {result.ticks} ticks replayed, every output bit-identical{end}")
     return 0

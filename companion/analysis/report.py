@@ -123,6 +123,8 @@ def _results(summary: dict[str, Any], stride: int, catches: bool) -> list[Table]
     if clock["kind"] == "simulated":
         pace = "" if clock["pace"] is None else f", {clock['pace']:.1f} x real time"
         processes.insert(0, ("clock", f"simulated{pace}"))
+    if summary["log_end_missing"] is not None:
+        processes.append(("end of the log", summary["log_end_missing"]))
     if recorder.get("error"):
         processes.append(("recorder", recorder["error"]))
     return [

@@ -68,6 +68,7 @@ def summarise(
         "contact": None,
         "intercept": None,
         "graded_every": 1,
+        "log_end_missing": None if log is None else log.end_missing,
         "world": None,
         "autopilot": None,
         "clock": {"kind": "real" if log is None else log.clock, "pace": None, "speed": None},

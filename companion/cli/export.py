@@ -50,7 +50,9 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.format == "lerobot":
             if out is None:
                 raise ConfigError("companion export: --format lerobot needs --out, the folder of the dataset")
-            frames = write_lerobot([FlightLog.read(path, ticks_max=ticks_max) for path in paths], out)
+            logs = [FlightLog.read(path, ticks_max=ticks_max) for path in paths]
+            frames = write_lerobot(logs, out)
+            _report_ends(logs)
             print(f"{out}: {len(paths)} episodes, {frames} frames")
             return EXIT_OK
         if arguments.format == "foxglove":
@@ -59,17 +61,17 @@ def run(arguments: argparse.Namespace) -> int:
                     "companion export: --format foxglove needs --out, the file to write, such as both.mcap"
                 )
             out.parent.mkdir(parents=True, exist_ok=True)
-            logs = {
-                name: FlightLog.read(path, ticks_max=ticks_max)
-                for name, path in zip(names_of(paths), paths, strict=True)
-            }
-            write_viewer_file(logs, out)
+            logs = [FlightLog.read(path, ticks_max=ticks_max) for path in paths]
+            write_viewer_file(dict(zip(names_of(paths), logs, strict=True)), out)
+            _report_ends(logs)
             print(out)
             return EXIT_OK
         for path, name in zip(paths, names_of(paths), strict=True):
             folder = path.parent if out is None else out / name if len(paths) > 1 else out
-            for written in write_tables(FlightLog.read(path, ticks_max=TICKS_KEPT), folder, arguments.format):
+            log = FlightLog.read(path, ticks_max=TICKS_KEPT)
+            for written in write_tables(log, folder, arguments.format):
                 print(written)
+            _report_ends([log])
     except LogError as error:
         raise ConfigError(str(error)) from None
     except ImportError:
@@ -79,3 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
             raise  # of standard output
         raise ConfigError(f"companion export: {error.filename}: cannot be written: {error.strerror}") from None
     return EXIT_OK
+
+
+def _report_ends(logs: list[FlightLog]) -> None:
+    for log in logs:
+        log.report_missing_end()

@@ -36,6 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
         fit = fit_hover_thrust(log)
     except (LogError, HoverFitError) as error:
         raise ConfigError(str(error)) from None
+    log.report_missing_end()
     if arguments.json:
         print(json.dumps(jsonable(fit), indent=2, allow_nan=False))
     else:

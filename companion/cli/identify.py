@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         log, part = read_part(arguments.log)
         found = identify(log)
+        log.report_missing_end()
     except LogError as error:
         raise ConfigError(str(error)) from None
     vehicle_file = _vehicle_file(arguments, found.flight.vehicle_file)

@@ -111,9 +111,8 @@ def graded(path: Path) -> Graded:
     log = FlightLog.read(path, ticks_max=TICKS_MAX)
     own = summarise(log, outcome=Outcome.LOST.value, controller="", preset="")
     known, note = _known(path.parent / "summary.json", own)
-    recorded = [outputs.outcome for outputs in log.outputs if outputs.outcome is not None]
     summary = own | {
-        "outcome": known.get("outcome") or (recorded or [Outcome.LOST])[-1].value,
+        "outcome": known.get("outcome") or (log.outcome or Outcome.LOST).value,
         "controller": _setting(log, "law"),
         "preset": _setting(log, "preset"),
         "payload_kg": known.get("payload_kg"),
@@ -159,6 +158,7 @@ def _one(path: Path, arguments: argparse.Namespace) -> int:
         raise _refusal(f"{out}: its summary.json is of another flight; choose another folder with --out")
     if flight.note is not None:
         print_error(flight.note)
+    flight.log.report_missing_end()
     if arguments.gif is not None:
         _write_gif(flight, arguments.gif)
     if arguments.json:

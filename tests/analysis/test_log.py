@@ -41,6 +41,7 @@ def test_a_log_gives_back_every_record_bit_for_bit(flight: FlightLog) -> None:
     for logged, row in zip(flight.rows(), rows, strict=True):
         assert differences(logged, row) is None
     assert flight.closed
+    assert flight.end_missing is None
     assert flight.config == CONFIG
     assert flight.missing_ticks() == 0
 
@@ -109,9 +110,32 @@ def test_a_log_cut_anywhere_is_read_up_to_its_last_whole_chunk(flight: FlightLog
         cut.write_bytes(data[: int(share * len(data))])
         log = FlightLog.read(cut)
         assert not log.closed
+        last = f"its last whole tick is at t = {log.inputs[-1].t_s:.3f} s"
+        assert log.end_missing == (
+            f"the log was not closed: {last}, the outcome is in it"
+            if share > 0.999
+            else f"the log ends before the flight did: {last}, the outcome is not in it"
+        )
         assert len(log.inputs) > 0.25 * len(flight.inputs)
         assert log.inputs == flight.inputs[: len(log.inputs)]
         assert len(log.outputs) == len(log.sent) == len(log.inputs)
+
+
+def test_a_log_whose_first_bytes_are_all_that_is_left_has_no_ticks_or_is_refused(
+    flight: FlightLog, tmp_path: Path
+) -> None:
+    data, cut, ends = flight.path.read_bytes(), tmp_path / "cut.mcap", set()
+    for size in (1, 7, 8, 9, 100, 1000, 5000, 20_000):
+        cut.write_bytes(data[:size])
+        try:
+            log = FlightLog.read(cut)
+            ends.add(log.end_missing)
+        except LogError as error:
+            ends.add(str(error).removeprefix(f"{cut}: "))
+    assert ends == {
+        "not a flight log, or cut off at its beginning: it has no 'companion' metadata record",
+        "the log was not closed and has no ticks",
+    }
 
 
 def test_a_file_that_is_no_flight_log_is_refused_in_one_line(flight: FlightLog, tmp_path: Path) -> None:

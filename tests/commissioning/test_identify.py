@@ -114,7 +114,7 @@ def cut(log: FlightLog, begin: int, end: int) -> FlightLog:
     ("spoil", "why"),
     [
         (lambda log: cut(log, 0, 300), "did not fly"),
-        (lambda log: cut(log, 0, 3000), "was killed or its log is cut off"),
+        (lambda log: cut(log, 0, 3000), "ends before the flight did"),
         (lambda log: cut(log, len(log.inputs) - 1500, len(log.inputs)), "too short"),
         (lambda log: replace(log, metadata={}), "has no configuration"),
     ],

@@ -117,6 +117,7 @@ def fairness(flights: Sequence[Flight], settings: Sequence[Setting]) -> tuple[st
     failed = [f"{flight.letter} ({flight.summary['outcome']})" for flight in flights if not flight.completed]
     if failed:
         cautions.append(f"Not completed: {', '.join(failed)}. RMS errors of an incomplete mission are not marked.")
+    cautions += [f"{flight.letter}: {end}." for flight in flights if (end := flight.summary["log_end_missing"])]
     if not same_mission:
         cautions.append("RMS errors of different missions are not marked better or worse.")
     return fair, cautions, same_mission

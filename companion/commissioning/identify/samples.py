@@ -69,13 +69,12 @@ class Flight:
             LogError: the log has no configuration, or no flight that ended regularly and was long enough.
         """
         vehicle = log.flight_config().vehicle
-        outcome = next((o.outcome for o in reversed(log.outputs) if o.outcome is not None), None)
         parts = _airborne(log, vehicle)
         if not parts and not any(o.phase_kind is PhaseKind.FLIGHT for o in log.outputs):
             raise LogError(f"{log.path}: the vehicle did not fly; expected the log of a flight")
-        if outcome not in (Outcome.COMPLETED, Outcome.ABORTED):
-            how = "was killed or its log is cut off" if outcome is None else f"ended as {outcome.value}"
-            raise LogError(f"{log.path}: the flight {how}; expected one that ended with a landing")
+        if log.outcome not in (Outcome.COMPLETED, Outcome.ABORTED):
+            how = log.end_missing if log.outcome is None else f"the flight ended as {log.outcome.value}"
+            raise LogError(f"{log.path}: {how}; expected a flight that ended with a landing")
         log_s = sum(end - begin for begin, end in parts) * STEP_S
         if log_s < FLIGHT_MIN_S:
             raise LogError(

@@ -43,7 +43,7 @@ def read_for_page(path: Path, number: int) -> ReplayLog:
     """
     log = FlightLog.read(path, ticks_max=TICKS_MAX)
     if not log.inputs:
-        raise LogError(f"{path}: has no ticks")
+        raise LogError(f"{path}: {log.end_missing or 'has no ticks'}")
     config = log.flight_config()
     session = f"log-{number}"
     streams, events = replay(log.rows(), config, session, 1e-9 * log.epoch_offset_ns, max_records=STREAMS_MAX)
@@ -74,7 +74,6 @@ def _preflight(log: FlightLog) -> tuple[PreflightRow, ...]:
 
 def _state(log: FlightLog, config: FlightConfig, session: str) -> State:
     flight = log.metadata.get("flight", {})
-    outcome = log.outputs[-1].outcome
     return State(
         v=VERSION,
         vehicle=topic_name(config.vehicle.ground.topic, config.vehicle.name),
@@ -86,6 +85,6 @@ def _state(log: FlightLog, config: FlightConfig, session: str) -> State:
         preset=config.controller.preset,
         wall_s=1e-9 * log.epoch_offset_ns + log.inputs[-1].t_s,
         commands=False,
-        outcome=None if outcome is None else outcome.value,
-        text=f"{log.path}, {writer(log.metadata)}" + ("" if log.closed else "; the log was not closed"),
+        outcome=None if log.outcome is None else log.outcome.value,
+        text=f"{log.path}, {writer(log.metadata)}" + ("" if log.end_missing is None else f"; {log.end_missing}"),
     )
