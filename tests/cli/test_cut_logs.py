@@ -15,7 +15,8 @@ from companion.sitl_config.loader import load_sitl
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
 from tests.analysis.recorded import record
-from tests.commands import companion, run_here
+from tests.commands import companion
+from tests.support import run_here
 
 END = r"the log ends before the flight did: its last whole tick is at t = (\d+\.\d{3}) s, the outcome is not in it"
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from companion.analysis.log import FlightLog, LogError
@@ -15,6 +16,7 @@ from companion.cli.identify import RESULT, WORLD
 from companion.commissioning.identify.identification import identify
 from companion.config.loader import load_vehicle
 from companion.model.exit_codes import EXIT_BAD_INPUT
+from companion.model.types import Outcome
 from companion.sitl_config.loader import load_sitl, load_world
 from sitl.campaigns.flights import log_of
 from sitl.fast.loop import FastFlight
@@ -110,10 +112,16 @@ def cut(log: FlightLog, begin: int, end: int) -> FlightLog:
     return replace(log, inputs=log.inputs[begin:end], outputs=log.outputs[begin:end], sent=log.sent[begin:end])
 
 
+def ended(log: FlightLog, outcome: Outcome) -> FlightLog:
+    return replace(log, outputs=(*log.outputs[:-1], msgspec.structs.replace(log.outputs[-1], outcome=outcome)))
+
+
 @pytest.mark.parametrize(
     ("spoil", "why"),
     [
-        (lambda log: cut(log, 0, 300), "did not fly"),
+        (lambda log: ended(cut(log, 0, 300), Outcome.REFUSED), "did not fly"),
+        (lambda log: ended(log, Outcome.CRASHED), "the flight ended as crashed"),
+        (lambda log: cut(log, 0, 300), "ends before the flight did"),
         (lambda log: cut(log, 0, 3000), "ends before the flight did"),
         (lambda log: cut(log, len(log.inputs) - 1500, len(log.inputs)), "too short"),
         (lambda log: replace(log, metadata={}), "has no configuration"),

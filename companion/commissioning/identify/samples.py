@@ -69,12 +69,14 @@ class Flight:
             LogError: the log has no configuration, or no flight that ended regularly and was long enough.
         """
         vehicle = log.flight_config().vehicle
+        outcome = log.outcome
+        if log.inputs and outcome is None:
+            raise LogError(f"{log.path}: {log.end_missing}; expected a flight that ended with a landing")
         parts = _airborne(log, vehicle)
         if not parts and not any(o.phase_kind is PhaseKind.FLIGHT for o in log.outputs):
             raise LogError(f"{log.path}: the vehicle did not fly; expected the log of a flight")
-        if log.outcome not in (Outcome.COMPLETED, Outcome.ABORTED):
-            how = log.end_missing if log.outcome is None else f"the flight ended as {log.outcome.value}"
-            raise LogError(f"{log.path}: {how}; expected a flight that ended with a landing")
+        if outcome in (Outcome.REFUSED, Outcome.CRASHED, Outcome.LOST):
+            raise LogError(f"{log.path}: the flight ended as {outcome.value}; expected one that ended with a landing")
         log_s = sum(end - begin for begin, end in parts) * STEP_S
         if log_s < FLIGHT_MIN_S:
             raise LogError(
