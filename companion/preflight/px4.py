@@ -63,14 +63,14 @@ def firmware_row(firmware: str) -> Row:
 
     match = _FIRMWARE.match(firmware)
     if match is None:
-        return row(False, fix="flash a release of PX4 1.16 or 1.18")
+        return row(False, fix="flash a release of PX4 1.15 to 1.18")
     version, kind = (int(match[1]), int(match[2])), match[4]
     if version < OLDEST:
         return row(
-            False, Level.REFUSE, "flash a release of PX4 1.16 or 1.18: parameters of this version have different names"
+            False, Level.REFUSE, "flash a release of PX4 1.15 to 1.18: parameters of this version have different names"
         )
     if version not in KNOWN_GOOD:
-        return row(False, fix="this version was not tested: flash 1.16 or 1.18, or fly with care on a tether")
+        return row(False, fix="this version was not tested: flash 1.15 to 1.18, or fly with care on a tether")
     if kind != "release":
         return row(False, fix=f"this is a {kind} build: flash a release build")
     return row(True)

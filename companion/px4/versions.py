@@ -1,7 +1,7 @@
 """Differences between PX4 1.15, 1.16, 1.17 and 1.18 that matter here: which of them has which parameter.
 
-Read in the sources of 1.15.4, 1.16.1 and 1.17 (beta); 1.18 was tried in the simulated world. A parameter that is not named here is in
-all four. A development version may already be or still be without one of these, so none of them is required.
+Read in the sources of 1.15.4, 1.16.1 and 1.17 (beta), and all four tried in the simulated world. A parameter that is not named
+here is in all four. A development version may already be or still be without one of these, so none of them is required.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ Release = tuple[int, int]
 
 OLDEST: Release = (1, 15)
 """Older versions have other parameters."""
-KNOWN_GOOD: tuple[Release, ...] = ((1, 16), (1, 18))
+KNOWN_GOOD: tuple[Release, ...] = ((1, 15), (1, 16), (1, 17), (1, 18))
 """Versions with which missions have been flown, in simulation."""
 LAST: Mapping[str, Release] = {"COM_KILL_DISARM": (1, 17), "EKF2_GPS_DELAY": (1, 17), "SIM_BAT_ENABLE": (1, 17)}
 """The last version that has a parameter. In 1.18 SENS_GPS0_DELAY and SENS_GPS1_DELAY, and SIM_BAT_DRAIN 0, take their places."""

@@ -47,6 +47,10 @@ def rotor_geometry(airframe: Airframe) -> dict[str, Value]:
     return {**kind, **geometry_of(airframe), **outputs}
 
 
+SIMULATORS_OWN = "CBRK_SUPPLY_CHK"
+"""PX4's simulator keeps its own value: that of 1.15 has no supply voltage, and its check would refuse to arm."""
+
+
 def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) -> dict[str, Value]:
     """Return every parameter that is set on a real PX4 before it flies, by name.
 
@@ -55,9 +59,11 @@ def parameters(airframe: Airframe, config: WorldConfig, hover_command: float) ->
     """
     gains = {name: PX4_DEFAULTS[name] for name in _GAINS}
     mixed = {name: PX4_DEFAULTS[name] / ROLL_PITCH_SHARE for name in _MIXED_GAINS}
+    required = {
+        name: value for name, value in {**simulated_values(), **VEHICLE_DEFAULTS}.items() if name != SIMULATORS_OWN
+    }
     return {
-        **simulated_values(),
-        **VEHICLE_DEFAULTS,
+        **required,
         **BEFORE_BOOT,
         **gains,
         **mixed,

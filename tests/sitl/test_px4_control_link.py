@@ -119,6 +119,11 @@ def test_a_battery_of_the_world_takes_the_place_of_px4s_own() -> None:
     assert (worlds["SIM_BAT_ENABLE"], worlds["SIM_BAT_DRAIN"]) == (0, 0.0), "the second for 1.18, which lacks the first"
 
 
+def test_the_supply_check_stays_as_the_simulator_has_it() -> None:
+    """PX4 1.15's simulator has no supply voltage: with the check on, as vehicles want it, it did not arm."""
+    assert "CBRK_SUPPLY_CHK" not in parameters(VEHICLE.airframe, World(), 0.5)
+
+
 def test_a_px4_started_by_hand_that_still_runs_after_its_flight_is_found() -> None:
     with Instance.claim() as instance, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(instance.onboard_address)
