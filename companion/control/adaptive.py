@@ -219,6 +219,7 @@ class AdaptiveController:
         for i, row in enumerate(rows):
             row.set_error(e[i], e_dot[i], tau_ext[i], tau_d[i])
         s = tuple([row.s for row in rows])
+        learned = sent.unwinding(s)
         # 5 and 6: rho
         norm_s, norm_xi, norm_chi_ddot = self._norms(chi_ddot)
         b: Vec4 = (1.0, norm_xi, norm_xi * norm_xi, min(norm_chi_ddot, self._acceleration_cap))
@@ -250,8 +251,8 @@ class AdaptiveController:
         for _, row in self._controlled:
             row.advance(dt_s)
         self._desired.advance(dt_s, F_ext)
-        if learn:
-            load.advance(dt_s, s, state.arm_rate_rad_s)
+        if state.airborne:
+            load.advance(dt_s, learned, state.arm_rate_rad_s)
         log = ControlLog(
             error=e,
             error_rate=e_dot,

@@ -147,6 +147,20 @@ class Actuation:
         self.clipped = (False, False, False)
         """Whether vertical force, lateral force and joint torque were saturated."""
         self.any_clipped = False
+        self._nothing: Chi = (0.0,) * (6 + len(self._torque_max_nm))
+        self._over = self._nothing
+        """Command before less after saturation, all rows."""
+
+    def unwinding(self, error: Chi) -> Chi:
+        """Return what an integrator may integrate after the last tick: all rows but those whose integral would go further beyond the
+        limit. An integrator that waits for the end of a saturation that it has caused itself waits forever.
+
+        Args:
+            error: what is integrated, all rows; where it is positive, the command falls.
+        """
+        if not self.any_clipped:
+            return error
+        return tuple([row if row * over >= 0.0 else 0.0 for row, over in zip(error, self._over, strict=True)])
 
     def step(
         self,
@@ -170,6 +184,7 @@ class Actuation:
             yaw_rate_rad_s: desired rate of yaw.
         """
         force, clipped_z, clipped_xy = saturate_force(force_world_n, self._limits)
+        saturated = force
         if vertical_scale < 1.0:
             force = (0.0, 0.0, force[2] * vertical_scale)
         self.force_world_n = force
@@ -185,7 +200,7 @@ class Actuation:
         self.roll_pitch_yaw_rad = (roll, pitch, yaw_rad)
         collective = collective_n(force, body_z_world)
         self.collective_n = collective if collective > 0.0 else 0.0
-        clipped_arm = False
+        clipped_arm, asked_nm = False, torque_nm
         for joint, most in self._torque_max_nm:
             if not -most <= torque_nm[joint] <= most:
                 clipped_arm = True
@@ -195,6 +210,10 @@ class Actuation:
         self.arm_torque_nm = torque_nm
         self.clipped = (clipped_z, clipped_xy, clipped_arm)
         self.any_clipped = clipped_z or clipped_xy or clipped_arm
+        if self.any_clipped:
+            asked = (*force_world_n, 0.0, 0.0, 0.0, *asked_nm)
+            now = (*saturated, 0.0, 0.0, 0.0, *torque_nm)
+            self._over = tuple([before - after for before, after in zip(asked, now, strict=True)])
 
 
 def wrench_of(

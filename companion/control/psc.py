@@ -42,13 +42,12 @@ class PscController(ModelBasedLaw):
         )
 
     def step(self, dt_s: float, state: PlantState, reference: Reference, vertical_scale: float) -> Wrench:
-        """Run one tick of `dt_s`; the position error is integrated except on the ground and in saturation."""
+        """Run one tick of `dt_s`; the position error is integrated except on the ground and further into saturation."""
         wrench = super().step(dt_s, state, reference, vertical_scale)
-        limit, (clipped_z, clipped_xy, _) = self._c.integral_max_m_s2, wrench.log.saturated
-        for i, held in enumerate((clipped_xy, clipped_xy, clipped_z)):
-            if state.airborne and not held:
-                grown = self._integral_m_s2[i] + dt_s * self._c.position_ki_xyz[i] * wrench.log.error[i]
-                self._integral_m_s2[i] = max(-limit, min(limit, grown))
+        limit, e = self._c.integral_max_m_s2, self._actuation.unwinding(wrench.log.error)
+        for i in range(3 if state.airborne else 0):
+            grown = self._integral_m_s2[i] + dt_s * self._c.position_ki_xyz[i] * e[i]
+            self._integral_m_s2[i] = max(-limit, min(limit, grown))
         return wrench
 
     def _tau(

@@ -57,6 +57,5 @@ class PidLaw(Baseline):
     def acceleration(self, tick: Tick) -> Array:
         """Return x''_d - K_p e - K_d e' - K_i int e."""
         wanted: Array = tick.wanted_m_s2 - self._kp * tick.e - self._kd * tick.e_dot - self._integral
-        if tick.learn:
-            self._integral = (self._integral + tick.dt_s * self._ki * tick.e).clip(-self._most, self._most)
+        self._integral = (self._integral + tick.dt_s * self._ki * tick.unwinding_e).clip(-self._most, self._most)
         return wanted

@@ -111,6 +111,8 @@ class Tick:
     """Sum of the known forces: thrust along the measured body z, weight, and the measured force that is fed forward."""
     learn: bool
     """False on the ground and in saturation: estimates must not change."""
+    unwinding_e: Array
+    """The position error as an integrator may integrate it: 0 on the ground, and where the command would go further beyond a limit."""
 
 
 class Baseline(ABC):
@@ -146,6 +148,7 @@ class Baseline(ABC):
             np.array(reference.acceleration_world_m_s2),
             self._thrust_n * np.array(body_z) + self._fed_forward * force - weight,
             state.airborne and not sent.any_clipped,
+            np.array(sent.unwinding(e)[:3]) if state.airborne else np.zeros(3),
         )
         x, y, z = (self.mass_kg * self.acceleration(tick) + weight).tolist()
         torque, rate, e_tau = self._arm.step(dt_s, state, reference, e[6:], e_dot[6:], force)
